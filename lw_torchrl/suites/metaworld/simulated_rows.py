@@ -1,11 +1,16 @@
 """Rows (MuJoCo states on shared models), and a base class for engines that simulate groups of rows in threads."""
 
+import ctypes
 import os
+import threading
+import warnings
+import weakref
 from abc import abstractmethod
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache, partial
 from math import ceil
 from time import perf_counter
 from typing import Any
@@ -17,12 +22,60 @@ from numpy.typing import NDArray
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
-from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, StateView, sensor_index
+from lw_torchrl.suites.metaworld.observation import REWARD_WIDTH, Array, Index, Mask, StateView, sensor_index
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
 from lw_torchrl.suites.metaworld.tables import TaskReward, TaskSources
-from lw_torchrl.suites.metaworld.task_programs import SharedModel
+from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY, Places, SharedModel
 
 _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
+
+ROW = np.dtype(
+    [
+        ("model", np.int64),  # addresses of MuJoCo's mjModel and mjData
+        ("data", np.int64),
+        ("substeps", np.int64),
+        ("looks_ahead", np.int64),  # whether the next step may reuse this step's mj_forward
+        ("looked", np.int64),  # whether the state is that of an mj_forward
+        ("looks", np.int64),  # whether a step ends with mj_forward
+        ("inputs", np.int64),  # number of inputs, which are written before the first substep
+        ("zeros", np.int64),  # number of values that are set to zero after the last substep
+        ("outputs", np.int64),  # number of outputs, which are read at the end
+        ("inputs_at", np.int64, 9),  # addresses of float64
+        ("zeros_at", np.int64, 2),
+        ("outputs_at", np.int64, REWARD_WIDTH),
+        ("warnings_at", np.int64, 3),  # addresses of the int32 counts of warnings about an unstable simulation
+        ("seconds", np.float64),  # the time that the last step took
+    ]
+)
+"""One row as the compiled kernel sees it."""
+
+
+def addresses_of(*arrays: NDArray[Any]) -> list[int]:
+    """Return the address of each element of the arrays."""
+    found: list[int] = []
+    for array in arrays:
+        interface = array.__array_interface__
+        step = (interface["strides"] or (array.itemsize,))[0]
+        found += range(interface["data"][0], interface["data"][0] + step * len(array), step)
+    return found
+
+
+@cache
+def find_row_kernel() -> Callable[..., None] | None:
+    """Return the Numba kernel that simulates rows. If it cannot be compiled, warn and return None."""
+    try:
+        if os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
+            raise ImportError("NUMBA_DISABLE_JIT is set")
+        from lw_torchrl.suites.metaworld.row_kernel import leave_mujoco, simulate
+
+        return partial(simulate, leave_mujoco.address)
+    except Exception as error:  # a Numba that is too new can fail in any way, and the results are the same without it
+        warnings.warn(
+            f"engine: rows are simulated without Numba, which is slower ({type(error).__name__}: {error}); "
+            "pip install 'lw_torchrl[fast]', and set NUMBA_CACHE_DIR to a writable folder",
+            stacklevel=2,
+        )
+        return None
 
 
 class SimulatedRow:
@@ -57,11 +110,12 @@ class SimulatedRow:
         self.shared.holder = self
         return observation
 
-    def simulate(self, mocap: Array, control: Array, sensors: Array, warnings: NDArray[np.int32]) -> None:
-        """Simulate five physics steps, then fill ``sensors`` and ``warnings`` (3,) while the state is cached."""
+    def simulate(self, inputs: Array, outputs: Array) -> bool:
+        """Write the inputs (mocap position, controls), simulate five physics steps, and fill the outputs (sensors).
+        Return whether the simulation is stable."""
         self._take_model()
-        self.mocap[...] = mocap
-        self._control[...] = control
+        self.mocap[...] = inputs[:3]
+        self._control[...] = inputs[3:]
         if self._looked:
             self._substep_after_look()
             mujoco.mj_step(self._model, self._data, self._substeps - 1)
@@ -69,8 +123,22 @@ class SimulatedRow:
             mujoco.mj_step(self._model, self._data, self._substeps)
         mujoco.mj_forward(self._model, self._data)  # the next physics step starts its solver from these accelerations
         self._looked = True
-        self._numbers.take(self._sensor_index, out=sensors, mode="clip")
-        warnings[...] = self._warnings
+        self._numbers.take(self._sensor_index, out=outputs, mode="clip")
+        return bool((self._warnings == WARNED_ALREADY).all())
+
+    def describe(self) -> dict[str, Any]:
+        """Return the fields of :data:`ROW`. The model is one of this row's own, with its places of bodies and sites."""
+        self._own_model = model_with_places(self._model, self._places)
+        return {
+            "model": self._own_model.ctypes.data,
+            "data": self._data._address,
+            "substeps": self._substeps,
+            "looks": True,
+            "looks_ahead": True,
+            "inputs_at": addresses_of(self.mocap, self._control),
+            "outputs_at": np.array(addresses_of(self._numbers[:1]))+ 8 * self._sensor_index,
+            "warnings_at": addresses_of(self._warnings),
+        }
 
     def seen(self) -> tuple[RowModel, Any]:
         """Load this row's positions of bodies and sites into the shared model, then return the model and the data."""
@@ -116,46 +184,134 @@ def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
 
 
 class WorkerPool:
-    """A pool of threads that process groups of rows, slowest groups first. Only one thread at a time processes a group,
-    so the group's rows may share a model. The results do not depend on the thread."""
+    """A pool of threads. The calling thread works too, so a pool of one thread has no other."""
 
     def __init__(self, num_threads: int) -> None:
         self._helpers = num_threads - 1
-        self._threads = ThreadPoolExecutor(self._helpers, "lw_torchrl") if self._helpers else None
+        self._start()
+
+    def _start(self) -> None:
+        self._process = os.getpid()
+        self._call: list[Callable[[], object] | None] = [_do_nothing]
+        self._wake, self._busy = ([threading.Lock() for _ in range(self._helpers)] for _ in range(2))
+        for wake, busy in zip(self._wake, self._busy, strict=True):
+            wake.acquire()
+            # A daemon, because it waits inside acquire() when Python exits. It keeps no reference to the pool.
+            threading.Thread(target=_help, args=(wake, busy, self._call), name="lw_torchrl", daemon=True).start()
+        self._stop = weakref.finalize(self, _stop, self._call, self._wake)
+        self._stop.atexit = False
+
+    def run(self, call: Callable[[], object], helpers: int) -> None:
+        """Call ``call()`` in this thread and in at most ``helpers`` others at once, and wait for all of them."""
+        if self._process != os.getpid():  # a fork has the pool's locks, but not its threads
+            self._stop.detach()
+            self._start()
+        self._finish()  # after a KeyboardInterrupt, threads may still be busy
+        self._call[0] = call
+        for wake in self._wake[:helpers]:
+            if wake.locked():  # otherwise this thread has not yet noticed that it was woken up before
+                wake.release()
+        try:
+            call()
+        finally:
+            self._finish()
+
+    def _finish(self) -> None:
+        """Let no other thread start, and wait for those that have started."""
+        self._call[0] = _do_nothing
+        for busy in self._busy:
+            with busy:
+                pass
 
     def work(self, groups: Iterable[tuple[RowGroup, Sequence[int]]], do: Callable[[int], None]) -> None:
-        """Call ``do(item)`` for every item of every ``(group, items)`` pair; the items of one group run in order."""
-        if self._threads is None:
-            for _, items in groups:
-                for item in items:
-                    do(item)
-            return
+        """Call ``do(item)`` for every item of every ``(group, items)`` pair, slowest groups first. Only one thread at a
+        time processes a group, in order, so the group's rows may share a model."""
         waiting = deque(sorted(groups, key=lambda job: job[0].seconds * len(job[1]), reverse=True))
+        errors: list[BaseException] = []
 
         def work_through() -> None:
-            while True:
-                try:
-                    group, items = waiting.popleft()
-                except IndexError:
-                    return
-                start = perf_counter()
-                for item in items:
-                    do(item)
-                group.seconds = (perf_counter() - start) / len(items)
+            try:
+                while True:
+                    try:
+                        group, items = waiting.popleft()
+                    except IndexError:
+                        return
+                    start = perf_counter()
+                    for item in items:
+                        do(item)
+                    group.seconds = (perf_counter() - start) / len(items)
+            except BaseException as error:
+                waiting.clear()
+                errors.append(error)
 
-        helpers = min(self._helpers, len(waiting) - 1)
-        futures = [self._threads.submit(work_through) for _ in range(helpers)]
-        try:
-            work_through()
-        finally:
-            waiting.clear()
-            errors = [error for future in futures if (error := future.exception()) is not None]
-        for error in errors:
-            raise error
+        self.run(work_through, len(waiting) - 1)
+        if errors:
+            raise errors[0]
 
     def close(self) -> None:
-        if self._threads is not None:
-            self._threads.shutdown()
+        self._stop()
+
+
+def _do_nothing() -> None:
+    pass
+
+
+def _help(wake: threading.Lock, busy: threading.Lock, call: list[Callable[[], object] | None]) -> None:
+    while True:
+        wake.acquire()
+        with busy:
+            if (now := call[0]) is None:
+                return
+            now()
+            del now  # it refers to the rows of a step
+
+
+def _stop(call: list[Callable[[], object] | None], wakes: Sequence[threading.Lock]) -> None:
+    call[0] = None
+    for wake in wakes:
+        if wake.locked():
+            wake.release()
+
+
+def model_with_places(model: Any, places: Places) -> NDArray[np.int64]:
+    """Copy the C struct of a model, but with these positions of bodies and sites. All other arrays are shared."""
+    # No binding gives the size of the struct, but it has a block of memory for itself.
+    size = ctypes.CDLL(None).malloc_usable_size(ctypes.c_void_p(model._address))
+    struct = np.frombuffer((ctypes.c_char * size).from_address(model._address), np.int64, size // 8).copy()
+    for array, own in zip((model.body_pos, model.site_pos), places, strict=True):
+        (place,) = np.flatnonzero(struct == array.ctypes.data)
+        struct[place] = own.ctypes.data
+    return struct
+
+
+class CompiledRows:
+    """The rows of an engine, simulated by the Numba kernel."""
+
+    def __init__(self, kernel: Callable[..., None], rows: Sequence[Any], groups: Sequence[RowGroup]) -> None:
+        self._kernel = kernel
+        self.table = np.zeros(len(rows), ROW)
+        self._group = np.zeros(len(rows), np.intp)
+        for number, group in enumerate(groups):
+            self._group[list(group.rows)] = number
+        for row, described in zip(rows, self.table, strict=True):
+            fields = row.describe()
+            for name in ("inputs", "zeros", "outputs"):
+                addresses = fields.pop(f"{name}_at", ())
+                fields[name] = len(addresses)
+                described[f"{name}_at"][: len(addresses)] = addresses
+            for name, value in fields.items():
+                described[name] = value
+
+    def simulate(self, pool: WorkerPool, rows: Index, inputs: Array, outputs: Array) -> Mask:
+        """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
+        Rows of a group follow one another, since they share a model; the slowest group comes first."""
+        group = self._group[rows]
+        seconds = np.bincount(group, self.table["seconds"][rows]) / np.maximum(np.bincount(group), 1)
+        order = np.argsort(-seconds[group], kind="stable")
+        stable, turn = np.zeros(len(rows), dtype=bool), np.zeros(1, np.int64)
+        call = partial(self._kernel, self.table, rows, order, turn, inputs, outputs, stable)
+        pool.run(call, len(rows) - 1)
+        return stable
 
 
 def available_cores() -> int:
@@ -175,6 +331,30 @@ class ThreadedEngine(SeenRows):
         self._goal = np.zeros((len(keys), 3))
         self._observation = np.zeros((len(keys), layout.size))
         self._started, self._faulted = np.zeros((2, len(keys)), dtype=bool)
+        self._compiled: CompiledRows | None = None
+
+    def _compile(self) -> None:
+        """Simulate the rows with the Numba kernel, if there is one."""
+        if (kernel := find_row_kernel()) is not None:
+            self._compiled = CompiledRows(kernel, self._rows, self._groups)
+
+    def _simulate(self, rows: Index, inputs: Array, outputs: Array) -> Mask:
+        """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
+
+        The Python threads are slower than the kernel, which has the same bits: they run ten Python calls a row.
+        """
+        if self._compiled is not None:
+            return self._compiled.simulate(self._pool, rows, inputs, outputs)
+        stable = np.zeros(len(rows), dtype=bool)
+        place = {row: k for k, row in enumerate(rows.tolist())}
+
+        def simulate(row: int) -> None:
+            k = place[row]
+            with suppress(mujoco.FatalError):
+                stable[k] = self._rows[row].simulate(inputs[k], outputs[k])
+
+        self._pool.work(self._by_group(rows), simulate)
+        return stable
 
     @abstractmethod
     def _reset_row(self, row: int, seed: int) -> None:
@@ -195,6 +375,8 @@ class ThreadedEngine(SeenRows):
         # If a reset fails half-way, the rows must not be stepped.
         self._started[index] = False
         self._pool.work(self._by_group(index), lambda row: self._reset_row(row, seed_of[row]))
+        if self._compiled is not None:
+            self._compiled.table["looked"][index] = False
         self._observe_first(index)
         self._faulted[index] = False
         self._started[index] = True
@@ -206,7 +388,10 @@ class ThreadedEngine(SeenRows):
         self._faulted |= active & ~np.isfinite(action).all(axis=1)
         reward, success = np.zeros(len(active)), np.zeros(len(active), dtype=bool)
         if (rows := np.flatnonzero(active & ~self._faulted)).size:
+            # If a step is interrupted, the rows must be reset.
+            self._started[rows] = False
             self._step_running(rows, action, reward, success)
+            self._started[rows] = True
         return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
 
     def _by_group(self, rows: Index) -> list[tuple[RowGroup, list[int]]]:
@@ -226,4 +411,5 @@ class ThreadedEngine(SeenRows):
         """Stop the threads."""
         super().close()
         self._pool.close()
+        self._compiled = None
         self._rows = []
