@@ -17,7 +17,7 @@ from numba import carray, cfunc, from_dtype, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from lw_torchrl.suites.metaworld.simulated_rows import ROW
+from lw_torchrl.suites.metaworld.compiled_rows import ROW
 from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY
 
 # The bindings' library depends on MuJoCo's, so a look-up in it finds the copy of MuJoCo that the bindings use.

@@ -1,16 +1,13 @@
 """Rows (MuJoCo states on shared models), and a base class for engines that simulate groups of rows in threads."""
 
-import ctypes
 import os
 import threading
-import warnings
 import weakref
 from abc import abstractmethod
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, partial
 from math import ceil
 from time import perf_counter
 from typing import Any
@@ -22,60 +19,13 @@ from numpy.typing import NDArray
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
-from lw_torchrl.suites.metaworld.observation import REWARD_WIDTH, Array, Index, Mask, StateView, sensor_index
+from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel, model_with_places
+from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, StateView, sensor_index
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
 from lw_torchrl.suites.metaworld.tables import TaskReward, TaskSources
-from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY, Places, SharedModel
+from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY, SharedModel
 
 _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
-
-ROW = np.dtype(
-    [
-        ("model", np.int64),  # addresses of MuJoCo's mjModel and mjData
-        ("data", np.int64),
-        ("substeps", np.int64),
-        ("looks_ahead", np.int64),  # whether the next step may reuse this step's mj_forward
-        ("looked", np.int64),  # whether the state is that of an mj_forward
-        ("looks", np.int64),  # whether a step ends with mj_forward
-        ("inputs", np.int64),  # number of inputs, which are written before the first substep
-        ("zeros", np.int64),  # number of values that are set to zero after the last substep
-        ("outputs", np.int64),  # number of outputs, which are read at the end
-        ("inputs_at", np.int64, 9),  # addresses of float64
-        ("zeros_at", np.int64, 2),
-        ("outputs_at", np.int64, REWARD_WIDTH),
-        ("warnings_at", np.int64, 3),  # addresses of the int32 counts of warnings about an unstable simulation
-        ("seconds", np.float64),  # the time that the last step took
-    ]
-)
-"""One row as the compiled kernel sees it."""
-
-
-def addresses_of(*arrays: NDArray[Any]) -> list[int]:
-    """Return the address of each element of the arrays."""
-    found: list[int] = []
-    for array in arrays:
-        interface = array.__array_interface__
-        step = (interface["strides"] or (array.itemsize,))[0]
-        found += range(interface["data"][0], interface["data"][0] + step * len(array), step)
-    return found
-
-
-@cache
-def find_row_kernel() -> Callable[..., None] | None:
-    """Return the Numba kernel that simulates rows. If it cannot be compiled, warn and return None."""
-    try:
-        if os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
-            raise ImportError("NUMBA_DISABLE_JIT is set")
-        from lw_torchrl.suites.metaworld.row_kernel import leave_mujoco, simulate
-
-        return partial(simulate, leave_mujoco.address)
-    except Exception as error:  # a Numba that is too new can fail in any way, and the results are the same without it
-        warnings.warn(
-            f"engine: rows are simulated without Numba, which is slower ({type(error).__name__}: {error}); "
-            "pip install 'lw_torchrl[fast]', and set NUMBA_CACHE_DIR to a writable folder",
-            stacklevel=2,
-        )
-        return None
 
 
 class SimulatedRow:
@@ -136,7 +86,7 @@ class SimulatedRow:
             "looks": True,
             "looks_ahead": True,
             "inputs_at": addresses_of(self.mocap, self._control),
-            "outputs_at": np.array(addresses_of(self._numbers[:1]))+ 8 * self._sensor_index,
+            "outputs_at": np.array(addresses_of(self._numbers[:1])) + 8 * self._sensor_index,
             "warnings_at": addresses_of(self._warnings),
         }
 
@@ -273,47 +223,6 @@ def _stop(call: list[Callable[[], object] | None], wakes: Sequence[threading.Loc
             wake.release()
 
 
-def model_with_places(model: Any, places: Places) -> NDArray[np.int64]:
-    """Copy the C struct of a model, but with these positions of bodies and sites. All other arrays are shared."""
-    # No binding gives the size of the struct, but it has a block of memory for itself.
-    size = ctypes.CDLL(None).malloc_usable_size(ctypes.c_void_p(model._address))
-    struct = np.frombuffer((ctypes.c_char * size).from_address(model._address), np.int64, size // 8).copy()
-    for array, own in zip((model.body_pos, model.site_pos), places, strict=True):
-        (place,) = np.flatnonzero(struct == array.ctypes.data)
-        struct[place] = own.ctypes.data
-    return struct
-
-
-class CompiledRows:
-    """The rows of an engine, simulated by the Numba kernel."""
-
-    def __init__(self, kernel: Callable[..., None], rows: Sequence[Any], groups: Sequence[RowGroup]) -> None:
-        self._kernel = kernel
-        self.table = np.zeros(len(rows), ROW)
-        self._group = np.zeros(len(rows), np.intp)
-        for number, group in enumerate(groups):
-            self._group[list(group.rows)] = number
-        for row, described in zip(rows, self.table, strict=True):
-            fields = row.describe()
-            for name in ("inputs", "zeros", "outputs"):
-                addresses = fields.pop(f"{name}_at", ())
-                fields[name] = len(addresses)
-                described[f"{name}_at"][: len(addresses)] = addresses
-            for name, value in fields.items():
-                described[name] = value
-
-    def simulate(self, pool: WorkerPool, rows: Index, inputs: Array, outputs: Array) -> Mask:
-        """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
-        Rows of a group follow one another, since they share a model; the slowest group comes first."""
-        group = self._group[rows]
-        seconds = np.bincount(group, self.table["seconds"][rows]) / np.maximum(np.bincount(group), 1)
-        order = np.argsort(-seconds[group], kind="stable")
-        stable, turn = np.zeros(len(rows), dtype=bool), np.zeros(1, np.int64)
-        call = partial(self._kernel, self.table, rows, order, turn, inputs, outputs, stable)
-        pool.run(call, len(rows) - 1)
-        return stable
-
-
 def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -336,7 +245,7 @@ class ThreadedEngine(SeenRows):
     def _compile(self) -> None:
         """Simulate the rows with the Numba kernel, if there is one."""
         if (kernel := find_row_kernel()) is not None:
-            self._compiled = CompiledRows(kernel, self._rows, self._groups)
+            self._compiled = CompiledRows(kernel, self._rows, [group.rows for group in self._groups])
 
     def _simulate(self, rows: Index, inputs: Array, outputs: Array) -> Mask:
         """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
@@ -344,7 +253,7 @@ class ThreadedEngine(SeenRows):
         The Python threads are slower than the kernel, which has the same bits: they run ten Python calls a row.
         """
         if self._compiled is not None:
-            return self._compiled.simulate(self._pool, rows, inputs, outputs)
+            return self._compiled.simulate(rows, inputs, outputs, self._pool.run)
         stable = np.zeros(len(rows), dtype=bool)
         place = {row: k for k, row in enumerate(rows.tolist())}
 
