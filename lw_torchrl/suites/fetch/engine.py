@@ -126,16 +126,10 @@ class _Row:
         none = np.zeros(_DRIVEN.stop)
         grip = data.site_xpos[self._model.site("robot0:grip").id]
         objects = [none[_OBJECT], none[_QUATERNION]]
+        driven = driven or [none[_DRIVEN]]
         if self.has_object:
             objects = [data.site_xpos[self._model.site("object0").id], data.xquat[self._model.body("object0").id]]
-        self._sources = [
-            grip,
-            *self._fingers,
-            *objects,
-            data.xpos[hand],
-            data.xquat[hand],
-            *(driven or [none[_DRIVEN]]),
-        ]
+        self._sources = [grip, *self._fingers, *objects, data.xpos[hand], data.xquat[hand], *driven]
         self._warnings = data.warning.number[UNSTABLE]
 
     def reset(self, seed: int, read: Array) -> None:
@@ -159,9 +153,9 @@ class _Row:
         return bool((self._warnings == WARNED_ALREADY).all())
 
     def describe(self) -> dict[str, Any]:
-        """Return the fields of :data:`~lw_torchrl.suites.metaworld.compiled_rows.ROW`."""
+        """Return the arguments of :class:`~lw_torchrl.suites.metaworld.compiled_rows.CompiledRows` for this row."""
         return {
-            "model": self._model._address,
+            "model": self._model,
             "data": self.data._address,
             "substeps": self._substeps,
             "looks": self._blocked,

@@ -6,6 +6,7 @@ functions is missing, or if Numba finds no writable cache folder.
 """
 
 import ctypes
+import sys
 import time
 from typing import Any
 
@@ -16,9 +17,10 @@ from llvmlite import ir
 from numba import carray, cfunc, from_dtype, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 from lw_torchrl.suites.metaworld.compiled_rows import ROW
-from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY
+from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY, Places
 
 # The bindings' library depends on MuJoCo's, so a look-up in it finds the copy of MuJoCo that the bindings use.
 _mujoco = ctypes.CDLL(mujoco._functions.__file__)
@@ -49,10 +51,12 @@ set_of_thread = _function(_system, "pthread_setspecific", _int32, types.uint32, 
 longjmp = _function(_system, "longjmp", types.void, _pointer, _int32)
 _function(_system, "_setjmp", _int32, _pointer)
 
+_size_of_block = _system.malloc_size if sys.platform == "darwin" else _system.malloc_usable_size
+_size_of_block.argtypes, _size_of_block.restype = [ctypes.c_void_p], ctypes.c_size_t
 _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 _CLOCK = int(time.CLOCK_MONOTONIC)
 
-# The key of a thread's jump buffer. Compiled code reads it by name, because code from the cache runs in other processes.
+# The key of a thread's jump buffer. Compiled code finds it by name, because cached code runs in several processes.
 _key = ctypes.c_uint32()
 if _system.pthread_key_create(ctypes.byref(_key), None):
     raise ImportError("the process has no free key for data of its threads (pthread_key_create)")
@@ -142,7 +146,7 @@ def _try_row(row: Any, inputs: Any, outputs: Any, jump: Any) -> bool:
         return False
     _simulate_row(row, inputs, outputs)
     stable = True
-    for k in range(3):
+    for k in range(row.warnings):
         stable &= carray(pointer(row.warnings_at[k]), (1,), np.int32)[0] == WARNED_ALREADY
     return stable
 
@@ -186,3 +190,18 @@ def simulate(
         end = _seconds(scratch)
         row.seconds, start = end - start, end
     set_error_handler(other_handler)
+
+
+def model_with_places(model: Any, places: Places) -> NDArray[np.int64]:
+    """Copy the C struct of an MjModel, but with these positions of bodies and sites; return it as an array.
+
+    All other arrays of the model are shared, so each row can have a model with its own positions. The model must
+    outlive the copy.
+    """
+    # No function returns the size of the struct, but it fills a block of memory.
+    size = _size_of_block(model._address)
+    struct = np.frombuffer((ctypes.c_char * size).from_address(model._address), np.int64, size // 8).copy()
+    for array, own in zip((model.body_pos, model.site_pos), places, strict=True):
+        (field,) = np.flatnonzero(struct == array.ctypes.data)
+        struct[field] = own.ctypes.data
+    return struct

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
-from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel, model_with_places
+from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel
 from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, StateView, sensor_index
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
 from lw_torchrl.suites.metaworld.tables import TaskReward, TaskSources
@@ -77,16 +77,17 @@ class SimulatedRow:
         return bool((self._warnings == WARNED_ALREADY).all())
 
     def describe(self) -> dict[str, Any]:
-        """Return the fields of :data:`ROW`. The model is one of this row's own, with its places of bodies and sites."""
-        self._own_model = model_with_places(self._model, self._places)
+        """Return the arguments of :class:`~lw_torchrl.suites.metaworld.compiled_rows.CompiledRows` for this row."""
         return {
-            "model": self._own_model.ctypes.data,
+            "model": self._model,
+            "places": self._places,
             "data": self._data._address,
             "substeps": self._substeps,
             "looks": True,
             "looks_ahead": True,
             "inputs_at": addresses_of(self.mocap, self._control),
-            "outputs_at": np.array(addresses_of(self._numbers[:1])) + 8 * self._sensor_index,
+            "zeros_at": [],
+            "outputs_at": self._numbers.ctypes.data + self._numbers.itemsize * self._sensor_index,
             "warnings_at": addresses_of(self._warnings),
         }
 
@@ -199,6 +200,7 @@ class WorkerPool:
             raise errors[0]
 
     def close(self) -> None:
+        self._finish()
         self._stop()
 
 
@@ -285,7 +287,7 @@ class ThreadedEngine(SeenRows):
         self._started[index] = False
         self._pool.work(self._by_group(index), lambda row: self._reset_row(row, seed_of[row]))
         if self._compiled is not None:
-            self._compiled.table["looked"][index] = False
+            self._compiled.forget(index)
         self._observe_first(index)
         self._faulted[index] = False
         self._started[index] = True
