@@ -87,7 +87,9 @@ def _replay(work: Work, transform: Any, sampler: Any = None, **options: Any) -> 
     return lw.LanguageWorldExperienceReplay(work.demos, sampler=sampler, transform=transform, **options)
 
 
-def _cloning(work: Work, parts: Parts, plans: Any, size: int, steps: int, **options: Any) -> lw.BehavioralCloningTrainer:
+def _cloning(
+    work: Work, parts: Parts, plans: Any, size: int, steps: int, **options: Any
+) -> lw.BehavioralCloningTrainer:
     torch.manual_seed(0)
     actor = parts.actor("pcbc", parts.seen(plans))
     config = lw.BehavioralCloningConfig(steps=steps, batch_size=size)
@@ -338,7 +340,7 @@ def memory(work: Work) -> Iterator[Row]:
 
 
 def fallback(work: Work) -> Iterator[Row]:
-    """Steps that cannot be captured: one that waits for the device, and one that fails only when it is captured."""
+    """Steps that cannot be captured: one waits for the device, two fail only while they are captured."""
     plans = lw.load_plans("MT50")
 
     def waits(batch: TensorDictBase) -> TensorDictBase:
@@ -349,7 +351,12 @@ def fallback(work: Work) -> Iterator[Row]:
             raise RuntimeError("this transform is not captured")
         return batch
 
-    for function in (waits, fails):
+    def breaks(batch: TensorDictBase) -> TensorDictBase:
+        if work.device != "cpu" and torch.cuda.is_current_stream_capturing():
+            batch["action"].max().item()
+        return batch
+
+    for function in (waits, fails, breaks):
         torch.manual_seed(0)
         actor = Parts().actor("pcbc", plans)
         replay = _replay(work, Compose(lw.QAFTransform(plans)))
@@ -439,13 +446,13 @@ ROWS: dict[str, Callable[[Work], Iterator[Row]]] = {
     "env-on-device": env_on_device,
     "offline-steps": offline_steps,
     "evaluator-steps": evaluator_steps,
-    "fallback": fallback,
     "memory": memory,
     "gpu-tests": gpu_tests,
     "wait-for-cpu": wait_for_the_cpu,
     "workers": workers,
     "few-shot-success": few_shot_success,
     "threads": threads,
+    "fallback": fallback,
 }
 ON_REQUEST = {"few-shot-on-one-core": few_shot_on_one_core}
 ON_THE_CPU = ("machine", "workers", "threads")

@@ -39,19 +39,16 @@ class CapturedFunction:
     Args:
         function: a function of a TensorDict on the device, which returns tensors by name.
         device: the device.
-        capture: False to run the function as it is on every device.
 
     Attributes:
-        tries: whether the function is, or will be, captured.
+        tries: whether the function is, or will be, captured; set it to False to run the function as it is.
         is_captured: whether the function runs as a graph.
     """
 
-    def __init__(
-        self, function: Callable[[Any], dict[str, Tensor]], device: torch.device, capture: bool = True
-    ) -> None:
+    def __init__(self, function: Callable[[Any], dict[str, Tensor]], device: torch.device) -> None:
         self._function, self._device = function, device
         self._module = None if device.type == "cpu" else torch.get_device_module(device)
-        self.tries = capture and captures(device)
+        self.tries = captures(device)
         self.reset()
 
     def reset(self) -> None:

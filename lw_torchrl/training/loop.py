@@ -212,12 +212,14 @@ class Training:
     def _run(self, drawn: Any) -> dict[str, Tensor]:
         """Run :meth:`update` on what was drawn, on a CUDA device as one CUDA graph."""
         if self._captured is None:
-            captured = CapturedFunction(lambda each: self.update(self.batch(each)), self.device, self.capture is not False)
+            captured = CapturedFunction(lambda each: self.update(self.batch(each)), self.device)
             parts = [self, self.module, *self.networks]
             parts += [getattr(each.source, "transform", None) for each in self.minibatches]
-            if self.capture is None and captured.tries and (kind := foreign_class(parts)) is not None:
+            if self.capture is False:
+                captured.tries = False
+            elif self.capture is None and captured.tries and (kind := foreign_class(parts)) is not None:
                 name = f"{kind.__module__}.{kind.__qualname__}"
-                captured.give_up(f"{name} may change its attributes from step to step; if it does not, use capture=True")
+                captured.give_up(f"{name} may change its attributes from step to step; if not, use capture=True")
             self._captured = captured
         return self._captured(drawn, tuple(network.training for network in self.networks))
 

@@ -72,7 +72,7 @@ class Module(_DummyBackendModule):
     def get_sync_debug_mode(self):
         return self.mode
 
-    def Stream(self, device=None):  # noqa: N802 - as torch.cuda.Stream
+    def Stream(self, device=None):
         return SimpleNamespace(wait_stream=lambda other: None)
 
     current_stream = Stream
