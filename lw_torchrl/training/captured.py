@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Hashable, Iterable
+from types import NoneType
 from typing import Any
 
 import torch
@@ -15,13 +16,17 @@ PACKAGES = ("torch", "torchrl", "tensordict", "lw_torchrl")
 _WARM_UP = 2  # number of calls before the capture; the first call creates tables and the optimizer's state
 
 
-def foreign_class(objects: Iterable[Any]) -> type | None:
-    """Return the first class, among the objects and their submodules, that is not from :data:`PACKAGES`; else None."""
+def foreign_code(objects: Iterable[Any]) -> str:
+    """Return the name of a class or function, of the objects and their submodules, that is not from :data:`PACKAGES`;
+    "" if there is none.
+    """
     for item in objects:
         for part in item.modules() if isinstance(item, nn.Module) else [item]:
-            if part is not None and type(part).__module__.partition(".")[0] not in PACKAGES:
-                return type(part)
-    return None
+            function = getattr(part, "func", None)  # of a transform that wraps a function
+            for code in (type(part), function if hasattr(function, "__qualname__") else type(function)):
+                if code is not NoneType and code.__module__.partition(".")[0] not in PACKAGES:
+                    return f"{code.__module__}.{code.__qualname__}"
+    return ""
 
 
 def captures(device: torch.device) -> bool:
@@ -55,7 +60,9 @@ class CapturedFunction:
         """Discard the graph, for example because tensors were replaced; later calls capture the function again."""
         self._kind: Hashable = None
         self._calls, self.is_captured = 0, False
-        self._graph = self._inputs = self._outputs = None
+        self._graph: Any = None
+        self._inputs: list[tuple[Tensor, Any]] = []
+        self._outputs: dict[str, Tensor] = {}
 
     def __call__(self, minibatch: Any, mode: Hashable = None) -> dict[str, Tensor]:
         """Run the function on a minibatch on the CPU or on the device.
@@ -105,7 +112,7 @@ class CapturedFunction:
             with self._module.graph(graph, stream=self._stream):
                 self._outputs = self._function(kept.copy())
         except Exception as error:  # PyTorch and CUDA raise several types
-            self.give_up(f"CUDA cannot capture the step ({type(error).__name__}: {str(error).splitlines()[0]:.200})")
+            self.give_up(f"CUDA cannot capture the step ({type(error).__name__}: {str(error).partition(chr(10))[0]})")
             return
         self._inputs = [(each, key) for key, each in kept.items(True, True)]
         self._graph, self.is_captured = graph, True

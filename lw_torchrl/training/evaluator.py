@@ -124,7 +124,7 @@ class _PictureQueries:
         for name in ("pixels", "truths", "weights"):
             setattr(self, name, [tensor.to(device) for tensor in getattr(self, name)])
         self.clauses = [_on(clauses, device) for clauses in self.clauses]
-        self.positions = [tuple(tensor.to(device) for tensor in tensors) for tensors in self.positions]
+        self.positions = [(a.to(device), b.to(device), c.to(device)) for a, b, c in self.positions]
 
     @staticmethod
     def loss(network: Any, batch: TensorDictBase, config: Any) -> Tensor:

@@ -20,7 +20,7 @@ from lw_torchrl._util.checks import Count, check_value, typed
 from lw_torchrl._util.devices import CPU
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.progress import Progress
-from lw_torchrl.training.captured import CapturedFunction, captures, foreign_class
+from lw_torchrl.training.captured import CapturedFunction, captures, foreign_code
 from lw_torchrl.training.checkpoint import CheckpointFiles, check_finite, contents_of
 from lw_torchrl.training.minibatches import Minibatches
 from lw_torchrl.training.normalization import share_contacts
@@ -217,8 +217,7 @@ class Training:
             parts += [getattr(each.source, "transform", None) for each in self.minibatches]
             if self.capture is False:
                 captured.tries = False
-            elif self.capture is None and captured.tries and (kind := foreign_class(parts)) is not None:
-                name = f"{kind.__module__}.{kind.__qualname__}"
+            elif self.capture is None and captured.tries and (name := foreign_code(parts)):
                 captured.give_up(f"{name} may change its attributes from step to step; if not, use capture=True")
             self._captured = captured
         return self._captured(drawn, tuple(network.training for network in self.networks))
