@@ -6,6 +6,7 @@ row is measured by itself: an error is printed with its traceback, and the other
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import platform
@@ -134,7 +135,8 @@ def cloning_step(work: Work) -> Iterator[Row]:
     for capture in (True, False):
         trainer = _cloning(work, parts, plans, 500, 10_000, capture=capture)
         name = f"cloning step, {'captured' if capture else 'eager'}"
-        yield _measured(work, name, trainer, work.pick(500, 3), asked="0.8 ms" if capture else "")
+        asked = {"asked": "0.8 ms"} if capture else {}
+        yield _measured(work, name, trainer, work.pick(500 if capture else 50, 3), **asked)
         if capture and work.device != "cpu":
             yield _kernels(trainer)
             yield _profile(trainer, work.pick(300, 3))
@@ -209,20 +211,22 @@ def few_shot_success(work: Work) -> Iterator[Row]:
 def stacked_step(work: Work) -> Iterator[Row]:
     """Twenty one-shot models in one step, with conditions only, and with the recipe's augmentations."""
     plans, number = lw.load_plans("MT50"), work.pick(20, 2)
-    for name, parts in (("conditions", Parts()), ("one-shot recipe", TARGET)):
+    for name, parts, size in (("conditions", Parts(), 200), ("one-shot recipe", TARGET, 180)):
         for capture in (True, False):
             torch.manual_seed(0)
             actors = [parts.actor("pcbc", parts.seen(plans)) for _ in range(number)]
-            targets = lw.MT50[:number]
-            replays = [
-                _replay(work, parts.transform(actor), lw.CoLearningSampler(target))
-                for actor, target in zip(actors, targets, strict=True)
-            ]
-            config = lw.BehavioralCloningConfig(steps=10_000, batch_size=200)
-            options: dict[str, Any] = {"device": work.device, "progress": False, "capture": capture}
-            trainer = StackedBehavioralCloning(actors, replays, config, **options)
+            replays = []
+            for target, actor in zip([task for task in lw.MT50 if task not in lw.MT10], actors, strict=False):
+                one_shot = {"episodes": dict.fromkeys(lw.MT10, work.pick(10, 1)) | {target: 1}}
+                options = one_shot if size == 180 else {}
+                sampler = lw.CoLearningSampler(target, exact=True) if options else lw.TaskBalancedSampler()
+                replays.append(_replay(work, parts.transform(actor), sampler, **options))
+            config = lw.BehavioralCloningConfig(steps=10_000, batch_size=size)
+            how: dict[str, Any] = {"device": work.device, "progress": False, "capture": capture}
+            trainer = StackedBehavioralCloning(actors, replays, config, **how)
             title = f"{number} stacked models, {name}, {'captured' if capture else 'eager'}"
-            yield _measured(work, title, trainer, work.pick(50 if capture else 10, 2), asked="4 ms" if capture else "")
+            asked = {"asked": "4 ms"} if capture else {}
+            yield _measured(work, title, trainer, work.pick(50 if capture else 5, 2), **asked)
             del trainer, replays, actors
 
 
@@ -297,26 +301,36 @@ def env_on_device(work: Work) -> Iterator[Row]:
         yield row | {"hand": [round(value, 5) for value in rollout["observation"][0, -1, :3].cpu().tolist()]}
 
 
+def _same(tensors: list[torch.Tensor], others: list[torch.Tensor]) -> bool | float:
+    """Return True, or the largest difference."""
+    if all(map(torch.equal, tensors, others)):
+        return True
+    return max(float((one - other).abs().max()) for one, other in zip(tensors, others, strict=True))
+
+
 def exactness(work: Work) -> Iterator[Row]:
     """Whether a repeated training, and a resumed one, has the same bits on the device; and the CPU's losses."""
     plans, steps = lw.load_plans("MT50"), work.pick(60, 8)
 
-    def weights(trainer: Any) -> list[torch.Tensor]:
+    def trained(path: Path | None, until: int, capture: bool = True) -> list[torch.Tensor]:
+        parts = Parts(yaw=0.3, focus=True)
+        trainer = _cloning(work, parts, plans, 500, steps, checkpoint=path, capture=capture)
+        trainer.train(until=until)
         return [parameter.detach().cpu().clone() for parameter in trainer.actor.parameters()]
 
-    def trained(path: Path | None, until: int) -> Any:
-        trainer = _cloning(work, Parts(yaw=0.3, focus=True), plans, 500, steps, checkpoint=path)
-        trainer.train(until=until)
-        return trainer
+    def resumed(capture: bool) -> list[torch.Tensor]:
+        path = work.folder / f"resumed-{capture}.safetensors"
+        trained(path, steps // 2, capture)
+        return trained(path, steps, capture)
 
-    whole = weights(trained(None, steps))
-    again = weights(trained(None, steps))
-    path = work.folder / "resumed.safetensors"
-    trained(path, steps // 2)
-    resumed = weights(trained(path, steps))
-    same = {"repeated": again, "resumed": resumed}
-    row: Row = {"row": "same bits"}
-    yield row | {name: all(map(torch.equal, whole, found)) for name, found in same.items()}
+    whole = trained(None, steps)
+    row: Row = {
+        "row": "same bits",
+        "repeated": _same(whole, trained(None, steps)),
+        "resumed": _same(whole, resumed(True)),
+    }
+    eager = trained(None, steps, capture=False)
+    yield row | {"eager": _same(whole, eager), "resumed eager": _same(eager, resumed(False))}
     for device in dict.fromkeys((work.device, "cpu")):
         trainer = _cloning(replace(work, device=device), Parts(feature_noise=0.0), plans, 500, 10_000)
         yield {"row": f"losses without noise, {device}", "losses": [trainer.step().item() for _ in range(8)]}
@@ -400,7 +414,7 @@ def wait_for_the_cpu(work: Work) -> Iterator[Row]:
     pid = work.folder / "cpu.pid"
     if pid.exists():
         start = perf_counter()
-        while perf_counter() - start < 90 and not (work.folder / "few-shot-cpu.safetensors").exists():
+        while perf_counter() - start < 60 and not (work.folder / "few-shot-cpu.safetensors").exists():
             signal.sigtimedwait([], 0.5)
         yield {"row": "waited for one core", "seconds": round(perf_counter() - start, 1)}
         print((work.folder / "cpu.log").read_text()[-600:], flush=True)
@@ -438,19 +452,19 @@ def gpu_tests(work: Work) -> Iterator[Row]:
 ROWS: dict[str, Callable[[Work], Iterator[Row]]] = {
     "machine": machine,
     "cloning-step": cloning_step,
-    "few-shot": few_shot,
     "cpu-training": train_on_the_cpu,
-    "turned-step": turned_step,
+    "few-shot": few_shot,
     "stacked-step": stacked_step,
     "exactness": exactness,
+    "turned-step": turned_step,
     "env-on-device": env_on_device,
     "offline-steps": offline_steps,
     "evaluator-steps": evaluator_steps,
     "memory": memory,
     "gpu-tests": gpu_tests,
     "wait-for-cpu": wait_for_the_cpu,
-    "workers": workers,
     "few-shot-success": few_shot_success,
+    "workers": workers,
     "threads": threads,
     "fallback": fallback,
 }
@@ -484,7 +498,8 @@ def _measure(args: Arguments, work: Work, names: list[str], deadline: float) -> 
             continue
         start, function = perf_counter(), {**ROWS, **ON_REQUEST}[name]
         _write(work, {"begins": name})
-        signal.alarm(max(1, min(100, int(deadline + 20 - start))))
+        gc.collect()
+        signal.alarm(0 if args.no_restart else max(1, min(100, int(deadline + 20 - start))))
         try:
             for row in function(work):
                 _write(work, row)

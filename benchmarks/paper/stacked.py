@@ -22,6 +22,10 @@ from lw_torchrl.training.cloning import BehavioralCloningConfig
 from lw_torchrl.training.loop import Training, TrainingOptions, make_optimizer
 from lw_torchrl.training.minibatches import Minibatches, check_replay, describe_data, describe_replay
 from lw_torchrl.training.normalization import check_contacts, fit_normalization, statistics_of
+from lw_torchrl.transforms import FallbackTurns, JitterTarget, QAFTransform, RandomYaw
+
+_BY_ROW = (FallbackTurns, JitterTarget, QAFTransform, RandomYaw)
+"""Transforms that compute each row from this row alone."""
 
 
 def _check_actors(actors: Sequence[TensorDictModuleBase]) -> None:
@@ -41,7 +45,8 @@ class StackedBehavioralCloning(Training):
     """Train M actors, each on its own batches, as :class:`BehavioralCloningTrainer` trains one.
 
     One ``vmap`` computes all M actors. Each actor has the batches and augmentations that its seed gives it alone, so
-    that its losses are those it would have alone, up to rounding and the features' noise.
+    that its losses are those it would have alone, up to rounding and the features' noise; on a GPU, augmentations of
+    all actors draw from one seed.
 
     Args:
         actors: M policies with the same parts and plans and with their own weights, trained in place.
@@ -104,6 +109,8 @@ class StackedBehavioralCloning(Training):
         self._act = vmap(
             lambda p, b, batch: functional_call(actors[0], (p, b), (batch,)).get("action"), randomness="different"
         )
+        transforms = [describe_replay(replay)["transforms"] for replay in replays]
+        self._are_alike = all(each == transforms[0] for each in transforms)
         self.optimizer = make_optimizer([(self._parameters.values(), config.learning_rate)], config, self.device)
         self.resume()
 
@@ -117,10 +124,19 @@ class StackedBehavioralCloning(Training):
         return torch.stack([each.exclude("next") for each in drawn])
 
     def batch(self, drawn: TensorDictBase) -> TensorDictBase:
-        if not self.minibatches[0].draws_indices:
+        sources = [each.indexed for each in self.minibatches]
+        if any(source is None for source in sources):
             return drawn
-        rows = (each.rows(own) for each, own in zip(self.minibatches, drawn.unbind(0), strict=True))
-        return torch.stack([each.exclude("next") for each in rows])
+        pairs = list(zip(sources, drawn.unbind(0), strict=True))
+        if not self._are_alike:
+            return torch.stack([source.rows(own).exclude("next") for source, own in pairs])
+        rows = torch.stack([source.stored(own) for source, own in pairs])
+        for parts in zip(*(source.replay.transform for source in sources), strict=True):
+            if isinstance(parts[0], _BY_ROW):  # in one call for all models, which a GPU computes as fast as one
+                rows = parts[0](rows)
+            else:
+                rows = torch.stack([part(own) for part, own in zip(parts, rows.unbind(0), strict=True)])
+        return rows.exclude("next")
 
     def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
         actions = self._act(self._parameters, self._buffers, batch.exclude("action"))

@@ -54,6 +54,7 @@ class CapturedFunction:
         self._function, self._device = function, device
         self._module = None if device.type == "cpu" else torch.get_device_module(device)
         self.tries = captures(device)
+        self._stream: Any = None
         self.reset()
 
     def reset(self) -> None:
@@ -71,36 +72,39 @@ class CapturedFunction:
         """
         if self._module is None:
             return self._function(minibatch)
-        if not self.tries or not isinstance(minibatch, TensorDictBase):
-            return self._function(_moved(minibatch, self._device))
-        kind = mode, *((key, each.shape, each.dtype) for key, each in minibatch.items(True, True))
-        if kind != self._kind:
-            self.reset()
-            self._kind, self._stream = kind, self._module.Stream(self._device)
-        self._calls += 1
-        if not self.is_captured:
-            minibatch = _moved(minibatch, self._device)
-            if self._calls > _WARM_UP:
+        if self.tries and isinstance(minibatch, TensorDictBase):
+            kind = mode, *((key, each.shape, each.dtype) for key, each in minibatch.items(True, True))
+            if kind != self._kind:
+                self.reset()
+                self._kind, self._stream = kind, self._stream or self._module.Stream(self._device)
+            self._calls += 1
+            if self._calls > _WARM_UP and not self.is_captured:
+                minibatch = _moved(minibatch, self._device)
                 self._capture(minibatch)
-        if not self.is_captured:
-            return self._warm_up(minibatch)
+            if self.is_captured:
+                return self._replay(minibatch)
+        return self._run(_moved(minibatch, self._device))
+
+    def _replay(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
         for own, key in self._inputs:
             own.copy_(_pinned(minibatch.get(key), self._device), non_blocking=True)
         self._graph.replay()
         return {name: value.clone() for name, value in self._outputs.items()}  # the next replay overwrites the values
 
-    def _warm_up(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
-        """Run the function on the graph's stream; in the last call before the capture, look for waits."""
+    def _run(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        """Run the function, in the last call before the capture with a look at what waits for the device."""
         assert self._module is not None
+        if self._stream is None:
+            return self._function(minibatch)
         current = self._module.current_stream(self._device)
         self._stream.wait_stream(current)
-        with self._module.stream(self._stream):
-            if self._calls < _WARM_UP:
-                values = self._function(minibatch)
-            else:
+        with self._module.stream(self._stream):  # autograd stays on the stream of the first backward pass
+            if self.tries and self._calls == _WARM_UP:
                 values, wait = _watched(lambda: self._function(minibatch), self._module)
                 if wait:
                     self.give_up(f"{wait} waits for the device")
+            else:
+                values = self._function(minibatch)
         current.wait_stream(self._stream)
         return values
 

@@ -371,7 +371,10 @@ class Training:
         """Restore a state returned by :meth:`state_dict`."""
         for minibatches, stored in zip(self.minibatches, state["minibatches"], strict=True):
             minibatches.load_state_dict(stored)
+        rates = [group["lr"] for group in self.optimizer.param_groups]
         self.optimizer.load_state_dict(state["optimizer"])
+        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate  # on a GPU a tensor there, which the state holds on the CPU
         self._captured = None  # a CUDA graph would use the old state
         self.steps = state["step"]
         _set_learning_rates(self.optimizer, self.config, self.steps)

@@ -56,9 +56,9 @@ class Minibatches:
         return self.source.sample(self.size) if self._indexed is None else self._indexed.draw(self.size)
 
     @property
-    def draws_indices(self) -> bool:
-        """Whether :meth:`draw` draws only indices."""
-        return self._indexed is not None
+    def indexed(self) -> Any:
+        """The source that :meth:`draw` draws only indices of; None if it draws whole minibatches."""
+        return self._indexed
 
     def rows(self, drawn: Any) -> Any:
         """Return the minibatch for what :meth:`draw` returned, which must be on the device."""
@@ -96,6 +96,10 @@ class IndexedReplay:
         sampler, storage = self.replay.sampler, self.replay.storage
         index, more = sampler.draw(storage, size) if isinstance(sampler, GroupSampler) else (storage.draw(size), {})
         return TensorDict({"index": index, **more}, [size])
+
+    def stored(self, drawn: TensorDictBase) -> TensorDictBase:
+        """Return the rows at the indices, without the buffer's transforms."""
+        return self.replay.storage.get(drawn.get("index")).update(drawn)
 
     def rows(self, drawn: TensorDictBase) -> TensorDictBase:
         """Return the rows at the indices, with the buffer's transforms applied."""

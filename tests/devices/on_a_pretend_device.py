@@ -203,7 +203,9 @@ def test_graph_is_captured_again_where_the_step_changes(demos):
     def both(change):
         change(trainer)
         change(cpu)
-        assert [trainer.step().item() for _ in range(4)] == pytest.approx([cpu.step().item() for _ in range(4)], rel=1e-5)
+        assert [trainer.step().item() for _ in range(4)] == pytest.approx(
+            [cpu.step().item() for _ in range(4)], rel=1e-5
+        )
         assert trainer._captured.is_captured
 
     both(lambda each: each.actor.eval())

@@ -31,7 +31,11 @@ class Graph:
     def __init__(self):
         self.operations, self.before = [], {}
 
-    def record(self, func, args, kwargs, found, draws):
+    def record(self, func, args, kwargs, found, draws, on):
+        """Record an operation. A number in a tensor on the CPU becomes a constant, as in a CUDA graph."""
+        ours = {id(one.raw) for one in on}
+        fixed = lambda one: one if id(one) in ours or not isinstance(one, torch.Tensor) else one.clone()  # noqa: E731
+        args, kwargs = pytree.tree_map(fixed, (args, kwargs))
         self.operations.append((func, args, kwargs, found, draws))
 
     def keep(self, func, args, kwargs):
@@ -201,7 +205,8 @@ def _run(func, args, kwargs):
         Graph.recording.keep(func, raw_args, raw_kwargs)
     found = _drawn(func, raw_args, raw_kwargs) if draws else func(*raw_args, **raw_kwargs)
     if Graph.recording is not None:
-        Graph.recording.record(func, raw_args, raw_kwargs, found, draws)
+        ours = [one for one in flat if isinstance(one, PretendTensor)]
+        Graph.recording.record(func, raw_args, raw_kwargs, found, draws, ours)
     if not there or func.overloadpacket is aten._local_scalar_dense:
         return found
     if func.overloadpacket is aten._to_copy and not on and found is raw_args[0]:
