@@ -126,7 +126,7 @@ def place(module: Any, device: str | torch.device | None) -> torch.device:
 
 
 def copied_at_once(tensordict: TensorDictBase, device: torch.device) -> TensorDict:
-    """Copy the tensors of a flat tensordict from the CPU to a device, in one copy from pinned memory, without a wait."""
+    """Copy the tensors of a flat tensordict from the CPU to a device without waiting: one copy, from pinned memory."""
     arrays = {key: value.numpy() for key, value in tensordict.items()}
     ends = list(accumulate(-(-array.nbytes // _ALIGNED) * _ALIGNED for array in arrays.values()))
     buffer = torch.empty(ends[-1], dtype=torch.uint8, pin_memory=device.type == "cuda")

@@ -23,7 +23,8 @@ def foreign_code(objects: Iterable[Any]) -> str:
     for item in objects:
         for part in item.modules() if isinstance(item, nn.Module) else [item]:
             function = getattr(part, "func", None)  # of a transform that wraps a function
-            for code in (type(part), function if hasattr(function, "__qualname__") else type(function)):
+            codes: list[Any] = [type(part), function if hasattr(function, "__qualname__") else type(function)]
+            for code in codes:
                 if code is not NoneType and code.__module__.partition(".")[0] not in PACKAGES:
                     return f"{code.__module__}.{code.__qualname__}"
     return ""
