@@ -2,7 +2,7 @@
 
 MuJoCo's functions are called through their addresses in the library that MuJoCo's Python bindings have loaded, so the
 results are bit-identical to those of the bindings. Importing this module raises an error if Numba or one of the
-functions is missing, or if Numba finds no writable cache folder.
+functions is missing, if Numba finds no writable cache folder, and on other systems than Linux.
 """
 
 import ctypes
@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 
 from lw_torchrl.suites.metaworld.compiled_rows import ROW
 from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY, Places
+
+if sys.platform != "linux":
+    raise ImportError("the compiled simulation was tested on Linux only")
 
 # The bindings' library depends on MuJoCo's, so a look-up in it finds the copy of MuJoCo that the bindings use.
 _mujoco = ctypes.CDLL(mujoco._functions.__file__)
@@ -51,7 +54,7 @@ set_of_thread = _function(_system, "pthread_setspecific", _int32, types.uint32, 
 longjmp = _function(_system, "longjmp", types.void, _pointer, _int32)
 _function(_system, "_setjmp", _int32, _pointer)
 
-_size_of_block = _system.malloc_size if sys.platform == "darwin" else _system.malloc_usable_size
+_size_of_block = _system.malloc_usable_size
 _size_of_block.argtypes, _size_of_block.restype = [ctypes.c_void_p], ctypes.c_size_t
 _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 _CLOCK = int(time.CLOCK_MONOTONIC)
