@@ -10,17 +10,19 @@ import sys
 import threading
 import time
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
+from numba import njit
 from test_vectorized_engine import SHARING, TASKS, VARIED, differences, play, same_bits
 
 from lw_torchrl.suites.metaworld import row_kernel, simulated_rows
 from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel
-from lw_torchrl.suites.metaworld.simulated_rows import WorkerPool
+from lw_torchrl.suites.metaworld.simulated_rows import RowGroup, WorkerPool
 from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
@@ -299,21 +301,53 @@ def test_memory_stays_flat(steps):
     assert memory() - before < 2e6
 
 
-def test_pool_waits_for_a_thread_that_is_still_busy():
-    """A call that ends in the calling thread before another thread has finished."""
-    pool, done = WorkerPool(2), []
-    started = threading.Event()
+@pytest.mark.parametrize("fails", [False, True])
+def test_pool_waits_for_a_thread_that_is_still_busy(fails):
+    """The calling thread ends, or raises an error, before another thread has finished."""
+    pool, done, started = WorkerPool(2), [], threading.Event()
 
-    def call() -> None:
-        if threading.current_thread() is threading.main_thread():
-            assert started.wait(10)
-        else:
+    def do(item: int) -> None:
+        if threading.current_thread() is not threading.main_thread():
             started.set()
             time.sleep(0.05)
             done.append(True)
+        else:
+            assert started.wait(10)
+            if fails:
+                raise ZeroDivisionError
 
-    pool.run(call, 1)
+    with pytest.raises(ZeroDivisionError) if fails else nullcontext():
+        pool.work([(RowGroup([k]), [k]) for k in range(2)], do)
     assert done == [True]
+    pool.close()
+
+
+def test_no_two_threads_take_the_same_row():
+    @njit(nogil=True)
+    def take(counts: np.ndarray, times: int) -> None:
+        for _ in range(times):
+            row_kernel.add_atomically(counts.ctypes.data, 1)
+
+    counts = np.zeros(1, np.int64)
+    take(counts, 0)
+    threads = [threading.Thread(target=take, args=(counts, 1_000_000)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert counts[0] == 4_000_000
+
+
+@pytest.mark.parametrize("last", range(3))
+def test_call_returns_when_all_rows_are_done(last):
+    """Row ``last`` takes a second; the thread that does not simulate it waits."""
+    rows = [SmallRow() for _ in range(3)]
+    compiled, pool = CompiledRows(row_kernel, rows, [[0, 1, 2]]), WorkerPool(3)
+    compiled._table["substeps"][last] = 200_000
+    for now in (2, 4):
+        compiled.simulate(np.arange(3), np.ones((3, 3)), np.zeros((3, 7)), pool.run)
+        steps = [now * 100_000 if row == last else now for row in range(3)]
+        assert [round(row.data.time / row.model.opt.timestep) for row in rows] == steps
     pool.close()
 
 
