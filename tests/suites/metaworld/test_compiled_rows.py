@@ -91,6 +91,9 @@ def test_error_of_mujoco_is_caught_in_its_row(threads):
     rows = [SmallRow(), SmallRow(integrator=17), SmallRow(), SmallRow()]
     compiled, pool = CompiledRows(row_kernel, rows, [[0, 1, 2, 3]]), WorkerPool(threads)
     outputs = np.zeros((3, 7))
+    find_handler = row_kernel._mujoco._mjPRIVATE__get_tls_error_fn
+    find_handler.restype = ctypes.c_void_p
+    handler = find_handler()
     for _ in range(100):
         stable = compiled.simulate(np.array([0, 1, 2]), np.ones((3, 3)), outputs, pool.run)
         assert stable.tolist() == [True, False, True]
@@ -98,7 +101,8 @@ def test_error_of_mujoco_is_caught_in_its_row(threads):
     assert rows[0].data.time == pytest.approx(0.4)
     assert rows[0].data.mocap_pos.tolist() == [[1.0, 1.0, 1.0]]
     assert rows[3].data.time == 0.0
-    with pytest.raises(mujoco.FatalError):  # the bindings' handler is as before
+    assert find_handler() == handler
+    with pytest.raises(mujoco.FatalError):
         mujoco.mj_step(rows[1].model, rows[1].data)
 
 
