@@ -21,14 +21,24 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch and the simulation are no
 import torch
 import tyro
 
-from benchmarks import environment, language, pipelines, recording, sampling, scaling, simulation, training
+from benchmarks import (
+    environment,
+    language,
+    pipelines,
+    recording,
+    sampling,
+    scaling,
+    scaling_threads,
+    simulation,
+    training,
+)
 from benchmarks.report import Row, Settings, Skipped, as_markdown, as_text
 from lw_torchrl._util.files import write_json, write_text
 from lw_torchrl.suites.metaworld.simulated_rows import available_cores
 
 BENCHMARKS: dict[str, Callable[[Settings], list[Row]]] = {
     "steps": simulation.steps,
-    "threads": simulation.threads,
+    "threads": scaling_threads.threads,
     "gym_wrapper": environment.gym_wrapper,
     "envpool": environment.envpool,
     "overhead": environment.overhead,

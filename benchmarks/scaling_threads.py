@@ -16,11 +16,14 @@ import numpy as np
 import torch
 
 import lw_torchrl as lw
+from benchmarks.report import Row, Settings
 from lw_torchrl.suites.metaworld import simulated_rows
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 ROUNDS = 7
 ROWS_OF_A_PROCESS = 50
+LEAST = {50: 0.55, 400: 0.75}  # share of the limit that 16 threads should reach
+MOST_SERIAL = 0.06  # of a step of 400 rows on two cores
 
 
 def rows(threads: Sequence[int], sizes: Sequence[int] = (50, 400), seconds: float = 0.5) -> list[dict[str, Any]]:
@@ -33,6 +36,34 @@ def rows(threads: Sequence[int], sizes: Sequence[int] = (50, 400), seconds: floa
     torch.set_num_threads(1)
     limits = {count: _processes(count, seconds) for count in threads}
     return [_measure(n, count, limits[count], seconds) for n in sizes for count in threads]
+
+
+def threads(settings: Settings) -> list[Row]:
+    """1, 2, 4, 8 and 16 threads, as far as there are cores, against as many processes and against one thread."""
+    counts = [count for count in (1, 2, 4, 8, 16) if count <= simulated_rows.available_cores()]
+    found = rows(counts, (5,) if settings.quick else (50, 400), seconds=0.02 if settings.quick else 0.5)
+    lines = []
+    for line in found:
+        n, count, ours = line["rows"], line["threads"], line["compiled"]
+        name = f"engine, N = {n}, {count} thread{'s' * (count > 1)}"
+        one = next(other["compiled"] for other in found if other["rows"] == n)
+        least = LEAST.get(n) if count == 16 else None
+        lines.append(_rate(name, ours, f"{count} processes, the limit", line["limit"], least))
+        lines.append(_rate(name, ours, "Python threads", line["python"], {50: 1.0, 400: 1.1}.get(n * (count == 1))))
+        if count > 1:
+            lines.append(_rate(name, ours, "1 thread", one, 1.8 if count == 2 else None))
+        most = MOST_SERIAL if (n, count) == (400, 2) else None
+        share, met = line["serial"], None if most is None else line["serial"] <= most
+        lines.append(
+            Row(f"{name}: serial share of a step", share, "", target="" if most is None else "≤ 0.06", met=met)
+        )
+    return lines
+
+
+def _rate(name: str, ours: float, rival: str, theirs: float, least: float | None) -> Row:
+    ratio = ours / theirs
+    target, met = ("", None) if least is None else (f"ratio ≥ {least:g}", ratio >= least)
+    return Row(name, ours, "steps/s", rival, theirs, ratio, target=target, met=met)
 
 
 def _tasks(n: int) -> list[str]:
@@ -69,7 +100,7 @@ class _Env:
 
     def __init__(self, n: int, threads: int) -> None:
         self.n, self.number = n, 0
-        self.env = lw.LanguageWorldEnv("MT50", num_envs=n, num_threads=threads, max_steps=10**6)
+        self.env = lw.LanguageWorldEnv(lw.MT50[:n], num_envs=n, num_threads=threads, max_steps=10**6)
         self._state, self._actions = self.env.reset(), torch.from_numpy(_actions(n))
 
     def step(self) -> None:

@@ -101,15 +101,16 @@ class CompiledRows:
         self, rows: Index, inputs: Array, outputs: Array, run: Callable[[Callable[[], object], int], None]
     ) -> Mask:
         """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
-        ``run(call, helpers)`` runs ``call`` in this thread and at most ``helpers`` others."""
+        ``run(call, helpers)`` runs ``call``, which ends when all rows are done, in this thread and at most ``helpers``
+        others."""
         group = self._group[rows]
         seconds = np.bincount(group, self._table["seconds"][rows]) / np.maximum(np.bincount(group), 1)
         order = np.argsort(-seconds[group], kind="stable")  # the slowest group first
-        stable, turn = np.zeros(len(rows), dtype=bool), np.zeros(1, np.int64)
+        stable, counts = np.zeros(len(rows), dtype=bool), np.zeros(2, np.int64)
         handler = self._kernel.leave_mujoco.address
 
         def simulate() -> None:  # refers to self, so that MuJoCo's states stay while a thread is busy
-            self._kernel.simulate(handler, self._table, rows, order, turn, inputs, outputs, stable)
+            self._kernel.simulate(handler, self._table, rows, order, counts, inputs, outputs, stable)
 
         run(simulate, len(rows) - 1)
         return stable

@@ -2,7 +2,7 @@
 
 MuJoCo's functions are called through their addresses in the library that MuJoCo's Python bindings have loaded, so the
 results are bit-identical to those of the bindings. Importing this module raises an error if Numba or one of the
-functions is missing, or if Numba finds no writable cache folder.
+functions is missing, if Numba finds no writable cache folder, and on other systems than Linux.
 """
 
 import ctypes
@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 
 from lw_torchrl.suites.metaworld.compiled_rows import ROW
 from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY, Places
+
+if sys.platform != "linux":
+    raise ImportError("the compiled simulation was tested on Linux only")
 
 # The bindings' library depends on MuJoCo's, so a look-up in it finds the copy of MuJoCo that the bindings use.
 _mujoco = ctypes.CDLL(mujoco._functions.__file__)
@@ -48,10 +51,11 @@ set_error_handler = _function(_mujoco, "_mjPRIVATE__set_tls_error_fn", types.voi
 clock_gettime = _function(_system, "clock_gettime", _int32, _int32, _pointer)
 get_of_thread = _function(_system, "pthread_getspecific", _pointer, types.uint32)
 set_of_thread = _function(_system, "pthread_setspecific", _int32, types.uint32, _pointer)
+sched_yield = _function(_system, "sched_yield", _int32)
 longjmp = _function(_system, "longjmp", types.void, _pointer, _int32)
 _function(_system, "_setjmp", _int32, _pointer)
 
-_size_of_block = _system.malloc_size if sys.platform == "darwin" else _system.malloc_usable_size
+_size_of_block = _system.malloc_usable_size
 _size_of_block.argtypes, _size_of_block.restype = [ctypes.c_void_p], ctypes.c_size_t
 _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 _CLOCK = int(time.CLOCK_MONOTONIC)
@@ -81,14 +85,14 @@ def pointer(typing: Any, address: Any) -> Any:
 
 
 @intrinsic
-def take_number(typing: Any, address: Any) -> Any:
-    """Increment an int64 and return its old value; no two threads get the same value."""
+def add_atomically(typing: Any, address: Any, number: Any) -> Any:
+    """Add to an int64 and return its old value, while other threads do the same."""
 
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
-        return builder.atomic_rmw("add", place, ir.Constant(ir.IntType(64), 1), "seq_cst")
+        return builder.atomic_rmw("add", place, arguments[1], "seq_cst")
 
-    return _int64(_int64), emit
+    return _int64(_int64, _int64), emit
 
 
 @intrinsic
@@ -165,22 +169,23 @@ _SIGNATURE = types.void(
 
 @njit(_SIGNATURE, cache=True, nogil=True)
 def simulate(
-    handler: Any, table: Any, rows: Any, order: Any, turn: Any, inputs: Any, outputs: Any, stable: Any
+    handler: Any, table: Any, rows: Any, order: Any, counts: Any, inputs: Any, outputs: Any, stable: Any
 ) -> None:
-    """Simulate the rows that no other thread has taken. All threads of a step call this function at once, with the same
-    arrays.
+    """Simulate the rows that no other thread has taken, and wait for the other rows. All threads of a step call this
+    function at once, with the same arrays.
 
     ``handler`` is the address of :func:`leave_mujoco`; ``table`` is a table of :data:`ROW`; ``rows`` (n,) int64 are the
-    rows to simulate. ``order`` (n,) int64 says in which order they are taken, and ``turn`` (1,) int64 counts them.
-    Reads ``inputs`` (n, K) float64; writes ``outputs`` (n, W) float64 and ``stable`` (n,) bool.
+    rows to simulate, and ``order`` (n,) int64 says in which order. ``counts`` (2,) int64 are the numbers of rows taken
+    and done. Reads ``inputs`` (n, K) float64; writes ``outputs`` (n, W) float64 and ``stable`` (n,) bool.
     """
     jump, scratch = np.empty(128, np.int64), np.empty(2, np.int64)
     set_of_thread(jump_key(), pointer(jump.ctypes.data))
     other_handler = get_error_handler()
     set_error_handler(pointer(handler))
+    taken, done = counts.ctypes.data, counts.ctypes.data + 8
     start = _seconds(scratch)
     while True:
-        number = take_number(turn.ctypes.data)
+        number = add_atomically(taken, 1)
         if number >= len(order):
             break
         k = order[number]
@@ -189,6 +194,10 @@ def simulate(
         row.looked = row.looks_ahead
         end = _seconds(scratch)
         row.seconds, start = end - start, end
+        add_atomically(done, 1)
+    # The last rows take less than a millisecond, and a thread that sleeps wakes up late.
+    while add_atomically(done, 0) < len(order):
+        sched_yield()
     set_error_handler(other_handler)
 
 

@@ -142,7 +142,7 @@ class WorkerPool:
         self._start()
 
     def _start(self) -> None:
-        self._process = os.getpid()
+        self._process, self._idle = os.getpid(), True
         self._call: list[Callable[[], object] | None] = [_do_nothing]
         self._wake, self._busy = ([threading.Lock() for _ in range(self._helpers)] for _ in range(2))
         for wake, busy in zip(self._wake, self._busy, strict=True):
@@ -153,32 +153,40 @@ class WorkerPool:
         self._stop.atexit = False
 
     def run(self, call: Callable[[], object], helpers: int) -> None:
-        """Call ``call()`` in this thread and in at most ``helpers`` others at once, and wait for all of them."""
+        """Call ``call()`` in this thread and in at most ``helpers`` others at once. All work must be done when the call
+        of this thread returns; the other calls may return later."""
         if self._process != os.getpid():  # a fork has the pool's locks, but not its threads
             self._stop.detach()
             self._start()
-        self._finish()  # after a KeyboardInterrupt, threads may still be busy
+        if not self._idle:  # an error or Ctrl-C left a call
+            self._finish()
+        self._idle = False
         self._call[0] = call
         for wake in self._wake[:helpers]:
             if wake.locked():  # otherwise this thread has not yet noticed that it was woken up before
                 wake.release()
         try:
             call()
-        finally:
+        except BaseException:
             self._finish()
+            raise
+        self._call[0] = _do_nothing
+        self._idle = True
 
     def _finish(self) -> None:
-        """Let no other thread start, and wait for those that have started."""
+        """Let no other thread start the call, and wait for those that have started."""
         self._call[0] = _do_nothing
         for busy in self._busy:
             with busy:
                 pass
+        self._idle = True
 
     def work(self, groups: Iterable[tuple[RowGroup, Sequence[int]]], do: Callable[[int], None]) -> None:
         """Call ``do(item)`` for every item of every ``(group, items)`` pair, slowest groups first. Only one thread at a
         time processes a group, in order, so the group's rows may share a model."""
         waiting = deque(sorted(groups, key=lambda job: job[0].seconds * len(job[1]), reverse=True))
         errors: list[BaseException] = []
+        caller = threading.get_ident()
 
         def work_through() -> None:
             try:
@@ -194,6 +202,9 @@ class WorkerPool:
             except BaseException as error:
                 waiting.clear()
                 errors.append(error)
+            finally:
+                if threading.get_ident() == caller:
+                    self._finish()
 
         self.run(work_through, len(waiting) - 1)
         if errors:

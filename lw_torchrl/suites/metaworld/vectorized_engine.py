@@ -23,12 +23,13 @@ FINGERS = np.array([1.0, -1.0])  # one action value moves both fingers, in oppos
 class VectorizedEngine(simulated_rows.ThreadedEngine):
     """An engine that simulates physics in threads and computes everything else in NumPy for all rows at once.
 
-    For any number of threads, the results are bit-identical to those of
+    With Numba (``lw_torchrl[fast]``, on Linux), one compiled call simulates all rows; otherwise a warning says why not.
+    With or without it and for any number of threads, the results are bit-identical to those of
     :class:`~lw_torchrl.suites.metaworld.plain_engine.MetaWorldEngine`. Rows with the same XML file share a compiled
     model.
 
-    A row faults if the action is not finite or the simulation becomes unstable. The row then repeats the last stable
-    observation and is not simulated until it is reset; other rows are not affected.
+    A row faults if the action is not finite, the simulation becomes unstable or MuJoCo raises an error. The row then
+    repeats the last stable observation and is not simulated until it is reset; other rows are not affected.
 
     Args:
         tasks: the task of each row.

@@ -10,17 +10,19 @@ import sys
 import threading
 import time
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
+from numba import njit
 from test_vectorized_engine import SHARING, TASKS, VARIED, differences, play, same_bits
 
 from lw_torchrl.suites.metaworld import row_kernel, simulated_rows
 from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel
-from lw_torchrl.suites.metaworld.simulated_rows import WorkerPool
+from lw_torchrl.suites.metaworld.simulated_rows import RowGroup, WorkerPool
 from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
@@ -89,6 +91,9 @@ def test_error_of_mujoco_is_caught_in_its_row(threads):
     rows = [SmallRow(), SmallRow(integrator=17), SmallRow(), SmallRow()]
     compiled, pool = CompiledRows(row_kernel, rows, [[0, 1, 2, 3]]), WorkerPool(threads)
     outputs = np.zeros((3, 7))
+    find_handler = row_kernel._mujoco._mjPRIVATE__get_tls_error_fn
+    find_handler.restype = ctypes.c_void_p
+    handler = find_handler()
     for _ in range(100):
         stable = compiled.simulate(np.array([0, 1, 2]), np.ones((3, 3)), outputs, pool.run)
         assert stable.tolist() == [True, False, True]
@@ -96,7 +101,8 @@ def test_error_of_mujoco_is_caught_in_its_row(threads):
     assert rows[0].data.time == pytest.approx(0.4)
     assert rows[0].data.mocap_pos.tolist() == [[1.0, 1.0, 1.0]]
     assert rows[3].data.time == 0.0
-    with pytest.raises(mujoco.FatalError):  # the bindings' handler is as before
+    assert find_handler() == handler
+    with pytest.raises(mujoco.FatalError):
         mujoco.mj_step(rows[1].model, rows[1].data)
 
 
@@ -299,36 +305,65 @@ def test_memory_stays_flat(steps):
     assert memory() - before < 2e6
 
 
-def test_pool_waits_for_a_thread_that_is_still_busy():
-    """A call that ends in the calling thread before another thread has finished."""
-    pool, done = WorkerPool(2), []
-    started = threading.Event()
+@pytest.mark.parametrize("fails", [False, True])
+def test_pool_waits_for_a_thread_that_is_still_busy(fails):
+    """The calling thread ends, or raises an error, before another thread has finished."""
+    pool, done, started = WorkerPool(2), [], threading.Event()
 
-    def call() -> None:
-        if threading.current_thread() is threading.main_thread():
-            assert started.wait(10)
-        else:
+    def do(item: int) -> None:
+        if threading.current_thread() is not threading.main_thread():
             started.set()
             time.sleep(0.05)
             done.append(True)
+        else:
+            assert started.wait(10)
+            if fails:
+                raise ZeroDivisionError
 
-    pool.run(call, 1)
+    with pytest.raises(ZeroDivisionError) if fails else nullcontext():
+        pool.work([(RowGroup([k]), [k]) for k in range(2)], do)
     assert done == [True]
     pool.close()
 
 
-def test_closed_and_collected_pools_end_their_threads():
-    def threads() -> int:
-        return sum(thread.name == "lw_torchrl" for thread in threading.enumerate())
+def test_no_two_threads_take_the_same_row():
+    @njit(nogil=True)
+    def take(counts: np.ndarray, times: int) -> None:
+        for _ in range(times):
+            row_kernel.add_atomically(counts.ctypes.data, 1)
 
-    before = threads()
+    counts = np.zeros(1, np.int64)
+    take(counts, 0)
+    threads = [threading.Thread(target=take, args=(counts, 1_000_000)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert counts[0] == 4_000_000
+
+
+@pytest.mark.parametrize("last", range(3))
+def test_call_returns_when_all_rows_are_done(last):
+    """Row ``last`` takes a second; the thread that does not simulate it waits."""
+    rows = [SmallRow() for _ in range(3)]
+    compiled, pool = CompiledRows(row_kernel, rows, [[0, 1, 2]]), WorkerPool(3)
+    compiled._table["substeps"][last] = 200_000
+    for now in (2, 4):
+        compiled.simulate(np.arange(3), np.ones((3, 3)), np.zeros((3, 7)), pool.run)
+        steps = [now * 100_000 if row == last else now for row in range(3)]
+        assert [round(row.data.time / row.model.opt.timestep) for row in rows] == steps
+    pool.close()
+
+
+def test_closed_and_collected_pools_end_their_threads():
+    before = set(threading.enumerate())
     closed, collected = WorkerPool(3), WorkerPool(2)
-    assert threads() == before + 3
+    threads = set(threading.enumerate()) - before
+    assert len(threads) == 3
     for pool in (closed, collected):
         pool.run(lambda: None, 2)
     closed.close()
     del collected, pool
-    end = time.monotonic() + 10
-    while threads() > before and time.monotonic() < end:
-        time.sleep(0.01)
-    assert threads() == before
+    for thread in threads:
+        thread.join(10)
+        assert not thread.is_alive()
