@@ -53,13 +53,15 @@ class Collect:
     json: options.Json = False
 
     def run(self) -> Output:
-        from lw_torchrl._util.devices import place
-        from lw_torchrl.data.collection_policy import BEHAVIOURS
-
         suite = options.read_suite(self.suite, self.tasks)
         tasks = options.select_tasks(self.tasks, options.read_tasks(self.task_file, self.tasks), suite)
         policy: Any = self.policy
         behaviour = self.behaviour
+        options.start_workers(policy, self.device, self.workers, len(tasks) * self.episodes)
+        # Imported here, because these take seconds, in which the workers start.
+        from lw_torchrl._util.devices import place
+        from lw_torchrl.data.collection_policy import BEHAVIOURS
+
         if policy not in BEHAVIOURS:
             options.use_one_thread()
             policy = options.read_object(policy) if options.is_object(policy) else lw.load_actor(policy)

@@ -44,7 +44,6 @@ class Rollout:
 
     def choose(self, names: tuple[str, ...]) -> list[str]:
         """Load --suite and --task-file, and return the names of the selected tasks."""
-        options.use_one_thread()
         self.chosen_suite = options.read_suite(self.suite, names)
         self.known: Mapping[str, Task] = options.read_tasks(self.task_file, names, self.suite)
         return options.select_tasks(names, self.known, self.chosen_suite) if names else []
@@ -65,6 +64,7 @@ class Rollout:
 
     def policy(self, name: str, tasks: list[str]) -> tuple[Any, Plans | None, Any]:
         """Return a policy, the plans to show, and the evaluator that runs before the policy (or None)."""
+        options.use_one_thread()
         policy, plans = self._policy(name, tasks)
         if self.evaluator is None:
             return policy, plans, None
@@ -135,17 +135,19 @@ class Evaluate:
     episodes: Count = 20  # number of episodes of each task
     out: Maybe[Path] = None
     """folder for results.json, success.png, failures.png, plan_use.json and rollout.rrd, which shows the first failed
-    episode of up to three tasks, lowest success rate first (without failures, episode 0 of up to three tasks)"""
+    episode of the three tasks with most failures (without failures, episode 0 of up to three tasks)"""
     workers: options.Workers = None
     json: options.Json = False
     rollout: OmitArgPrefixes[Rollout] = field(default_factory=Rollout)
 
     def run(self) -> Output:
+        rollout = self.rollout
+        tasks, suite = rollout.choose(self.tasks), rollout.chosen_suite
+        options.start_workers(self.policy, rollout.device, self.workers, len(tasks) * self.episodes)
+        # Imported here, because these take seconds, in which the workers start.
         from lw_torchrl.data.collection_policy import BEHAVIOURS
         from lw_torchrl.training.checkpoint import demonstrated_tasks
 
-        rollout = self.rollout
-        tasks, suite = rollout.choose(self.tasks), rollout.chosen_suite
         if not tasks and self.policy in BEHAVIOURS:
             tasks = list(rollout.own_plans or (lw.MT10 if suite is None else suite.plans or suite.tasks))
         policy, plans, evaluator = rollout.policy(self.policy, tasks)
@@ -164,7 +166,7 @@ class Evaluate:
             failures = [failure.to_json() for failure in result.failures or ()]
             output.show("failures", failures, f"\n{result.failure_table()}")
         if self.out is not None:
-            recorded = _episodes_to_record(result)
+            recorded = episodes_to_record(result)
             with locked(self.out, "out", folder=True, wait=True):
                 self._write(self.out, result, policy, use, evaluator, recorded)
             names = ", ".join(f"{task} {episode}" for task, episode in recorded)
@@ -208,7 +210,7 @@ class Evaluate:
                 lw.log_rollout(logger, episode.steps, plans, **page)
 
 
-def _episodes_to_record(result: lw.EvaluationResult) -> list[tuple[str, int]]:
+def episodes_to_record(result: lw.EvaluationResult) -> list[tuple[str, int]]:
     """Return the first failed episode of the three tasks that failed most, or episode 0 of three tasks if none failed.
 
     Episodes are pairs of task and index.

@@ -18,6 +18,7 @@ from tyro.conf import Positional, arg
 import lw_torchrl as lw
 from lw_torchrl._util.checks import Count, counted
 from lw_torchrl._util.files import read_text
+from lw_torchrl._util.workers import start_early
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
@@ -183,6 +184,12 @@ def read_object(name: str) -> Any:
     if not callable(policy) or isinstance(policy, type):
         raise ValueError(f"the policy {name} must map a TensorDict to a TensorDict, got {policy!r:.80}")
     return policy
+
+
+def start_workers(policy: str, device: str, workers: int | None, episodes: int) -> None:
+    """Start worker processes early if ``episodes`` of 500 time steps will use them."""
+    if not is_object(policy) and device == "cpu":
+        start_early(workers, episodes * 500)
 
 
 def policy_name(policy: str) -> str:

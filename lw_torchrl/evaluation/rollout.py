@@ -14,9 +14,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from lw_torchrl._util.checks import unknown_name
 from lw_torchrl._util.devices import CPU, check_device, device_of
 from lw_torchrl._util.progress import Progress
+from lw_torchrl._util.workers import Episodes, spread
 from lw_torchrl.envs.episodes import FinishedEpisode, num_rows, policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.envs.workers import Episodes, spread
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import Task, TaskList
 from lw_torchrl.modules.parts import evaluating

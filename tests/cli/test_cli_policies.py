@@ -12,6 +12,7 @@ from commands import document, fails, run
 
 import lw_torchrl as lw
 from lw_torchrl.cli.demo import QUICK
+from lw_torchrl.cli.evaluate import episodes_to_record
 from lw_torchrl.cli.main import main
 
 TINY = ("--steps", "30", "--batch-size", "20", "--width", "16", "--depth", "1")
@@ -86,6 +87,26 @@ def test_evaluate_writes_result_figure_and_recording(capsys, policy, tmp_path):
     actor = lw.load_actor(policy)
     again = lw.evaluate(actor, tasks=["push", "reach"], episodes_per_task=1, seed=7, max_steps=60, progress=False)
     assert again.episodes == result.episodes
+    assert f"written to {out}; rollout.rrd shows the failed episodes push 0, reach 0" in printed
+    assert [row["episode"] for row in document(capsys, "info", out / "rollout.rrd")["episodes"]] == [
+        "push-0",
+        "reach-0",
+    ]
+
+
+def test_evaluate_records_the_first_failures_of_the_worst_tasks():
+    def recorded(**successes):
+        episodes = [
+            lw.evaluation.EpisodeResult(task, number, success, 1 if success else None, success, float(success))
+            for task, each in successes.items()
+            for number, success in enumerate(each)
+        ]
+        return episodes_to_record(lw.EvaluationResult({"tasks": [*successes]}, tuple(episodes)))
+
+    outcomes = dict(a=[True, False], b=[True, True], c=[False, False], d=[True, False], e=[False, False])
+    assert recorded(**outcomes) == [("c", 0), ("e", 0), ("a", 1)]
+    assert recorded(a=[True, True], b=[True, False]) == [("b", 1)]
+    assert recorded(a=[True], b=[True], c=[True], d=[True]) == [("a", 0), ("b", 0), ("c", 0)]
 
 
 def test_evaluate_runs_the_demonstrated_tasks_by_default(capsys, policy, tmp_path):

@@ -18,38 +18,51 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from types import ModuleType
 from typing import Any, TypeVar
 
 import cloudpickle
-import torch
-
-from lw_torchrl.suites.metaworld.simulated_rows import available_cores
 
 Episodes = Mapping[str, Sequence[int]]  # the indices of each task's episodes
 T = TypeVar("T")
 
-WORTHWHILE = 60_000  # time steps from which workers save more time than they take to start: about 20 s on one core
-_LARGEST = 64  # episodes per part; with more, progress would be coarse, and an interruption would lose more work
-_PARTS = 3  # parts per worker, because some tasks take longer than others
+START = 40_000  # time steps that one core simulates while the workers start and compile models
+_THREADED = 0.64  # measured time of this process with several simulation threads, relative to one thread
+_LARGEST = 64  # episodes per part: enough for networks, which run on blocks of 64 rows, and little lost by Ctrl-C
 _PRELOAD = ["lw_torchrl.evaluation.rollout", "lw_torchrl.data.collect", "metaworld"]
 
 
-def split(episodes: Episodes, workers: int) -> list[dict[str, Sequence[int]]]:
-    """Split episodes into parts of about equal size. A part holds few tasks, because a simulator is made for each."""
-    size = max(1, min(_LARGEST, sum(map(len, episodes.values())) // (_PARTS * workers)))
-    parts: list[dict[str, Sequence[int]]] = []
-    room = 0
-    for task, listed in episodes.items():
-        pieces = -(-len(listed) // size)
-        for piece in range(pieces):
-            chosen = listed[piece * len(listed) // pieces : (piece + 1) * len(listed) // pieces]
-            if len(chosen) > room:
-                parts.append({})
-                room = size
-            parts[-1][task] = chosen
-            room -= len(chosen)
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def choose_workers(workers: int | None, time_steps: int) -> int:
+    """Return ``workers``; for None, one per core if that saves time and this process is not a worker itself."""
+    if workers is not None:
+        return workers
+    cores = available_cores()
+    pays = time_steps * (_THREADED - 1 / cores) >= START  # from 290,000 steps on two cores, from 70,000 on 16
+    return cores if pays and multiprocessing.parent_process() is None else 1
+
+
+def start_early(workers: int | None, time_steps: int) -> None:
+    """Start the server of worker processes, if they will be used, while this process still imports PyTorch."""
+    if choose_workers(workers, time_steps) > 1:
+        with _starting():
+            forkserver.ensure_running()
+
+
+def split(episodes: Episodes, workers: int) -> list[dict[str, list[int]]]:
+    """Split episodes into parts of equal size, at least one for each worker. A part holds few tasks, because each task
+    takes time to set up."""
+    listed = [(task, episode) for task, numbers in episodes.items() for episode in numbers]
+    number = min(len(listed), workers * -(-len(listed) // (workers * _LARGEST)))
+    parts: list[dict[str, list[int]]] = [{} for _ in range(number)]
+    for place, (task, episode) in enumerate(listed):
+        parts[place * number // len(listed)].setdefault(task, []).append(episode)
     return parts
 
 
@@ -71,7 +84,7 @@ def spread(
             runs for each part, and the items are pickled.
         episodes: the indices of each task's episodes.
         workers: number of processes, 1 for this process only. None for one per core, or for this process only if the
-            episodes have few time steps, ``run`` cannot be pickled, or this process is a worker itself.
+            workers' start would take longer than they save, or ``run`` cannot be pickled.
         max_steps: maximum number of time steps of an episode.
         alone: whether None means this process only.
 
@@ -79,10 +92,8 @@ def spread(
         ValueError: ``run`` cannot be pickled.
         RuntimeError: a worker was killed.
     """
-    number = workers
-    if number is None:
-        pays = sum(map(len, episodes.values())) * max_steps >= WORTHWHILE
-        number = available_cores() if pays and not alone and multiprocessing.parent_process() is None else 1
+    time_steps = sum(map(len, episodes.values())) * max_steps
+    number = 1 if alone and workers is None else choose_workers(workers, time_steps)
     parts, pickled = split(episodes, number), b""
     if min(number, len(parts)) > 1:
         try:
@@ -95,13 +106,14 @@ def spread(
 
 
 def _in_workers(pickled: bytes, parts: list[Any], workers: int, on_steps: Callable[[int], object]) -> Iterator[Any]:
-    context: Any = multiprocessing.get_context("forkserver" if os.name == "posix" else "spawn")
+    context = multiprocessing.get_context("forkserver")
     alive, end = context.Pipe(duplex=False)
     steps, report = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(min(workers, len(parts)), context, _start, (pickled, alive, report))
     try:
-        with _starting(context):
+        with _starting():
             running: dict[Future[Any], Any] = {pool.submit(_work, part): part for part in parts}
+            pool.submit(int)  # the executor notices the death of a process that it started before the last submission
         while running:
             done = wait(running, timeout=0.2, return_when=FIRST_COMPLETED).done
             while steps.poll():
@@ -119,10 +131,9 @@ def _in_workers(pickled: bytes, parts: list[Any], workers: int, on_steps: Callab
 
 
 @contextmanager
-def _starting(context: Any) -> Iterator[None]:
+def _starting() -> Iterator[None]:
     """Keep the processes that are started from importing the user's script and from reacting to Ctrl-C."""
-    if context.get_start_method() == "forkserver":
-        context.set_forkserver_preload(_PRELOAD)
+    forkserver.set_forkserver_preload(_PRELOAD)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
     try:
@@ -155,8 +166,10 @@ _report: Connection
 def _start(pickled: bytes, alive: Connection, report: Connection) -> None:
     global _pickled, _report
     _pickled, _report = pickled, report
-    torch.set_num_threads(1)
     threading.Thread(target=_end_with, args=(alive,), daemon=True).start()
+    import torch  # here, because start_early must not wait for it
+
+    torch.set_num_threads(1)
 
 
 def _end_with(alive: Connection) -> None:
@@ -168,4 +181,5 @@ def _work(part: Episodes) -> bytes:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         items = list(pickle.loads(_pickled)(part, _report.send))
-    return pickle.dumps((items, [(str(warning.message), warning.category) for warning in caught]))
+    different = dict.fromkeys((str(warning.message), warning.category) for warning in caught)
+    return pickle.dumps((items, list(different)))
