@@ -196,7 +196,7 @@ class QueryEvaluatorTrainer(Training):
         evaluator: the evaluator, trained in place; the evaluator's plans do not affect training.
         data: the queries and their answers, some of which are held out.
         config: the config from which ``data`` was built; pictures require an :class:`ImageQueryEvaluatorConfig`.
-        device: the device to train on, see :class:`BehavioralCloningTrainer`.
+        device: the device to train on, see :class:`BehavioralCloningTrainer`; states and pictures are kept there.
         **options: keyword arguments of :class:`~lw_torchrl.training.loop.Training`, which also lists their errors.
             :func:`load_evaluator` reads the checkpoint.
 
