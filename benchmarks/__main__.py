@@ -1,4 +1,4 @@
-"""python -m benchmarks [NAMES...] [--quick] [--compile] [--out runs/benchmarks] [--markdown]"""
+"""python -m benchmarks [NAMES...] [--quick] [--compile] [--out runs/benchmarks] [--markdown], or scaling [--gpu]"""
 
 from __future__ import annotations
 
@@ -21,14 +21,24 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch and the simulation are no
 import torch
 import tyro
 
-from benchmarks import environment, language, pipelines, recording, sampling, simulation, training
+from benchmarks import (
+    environment,
+    language,
+    pipelines,
+    recording,
+    sampling,
+    scaling,
+    scaling_threads,
+    simulation,
+    training,
+)
 from benchmarks.report import Row, Settings, Skipped, as_markdown, as_text
 from lw_torchrl._util.files import write_json, write_text
 from lw_torchrl.suites.metaworld.simulated_rows import available_cores
 
 BENCHMARKS: dict[str, Callable[[Settings], list[Row]]] = {
     "steps": simulation.steps,
-    "threads": simulation.threads,
+    "threads": scaling_threads.threads,
     "gym_wrapper": environment.gym_wrapper,
     "envpool": environment.envpool,
     "overhead": environment.overhead,
@@ -108,6 +118,9 @@ def _rows(report: dict[str, Any]) -> list[Row]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run benchmarks; return 1 if one failed. Slow ones do not count as failed."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if given[:1] == ["scaling"]:
+        return scaling.main(given[1:])
     args = tyro.cli(Arguments, args=arguments, prog="python -m benchmarks")
     results = args.out / "results.json"
     if args.markdown:

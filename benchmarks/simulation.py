@@ -1,13 +1,10 @@
-"""The engine against the physics alone, Meta-World's own step, and its own second thread."""
+"""The engine against the physics alone and Meta-World's own step."""
 
 from __future__ import annotations
 
 import warnings
-from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -16,9 +13,8 @@ import numpy as np
 from metaworld.policies import ENV_POLICY_MAP
 
 import lw_torchrl as lw
-from benchmarks.report import Row, Settings, Skipped, bars, compare, timed, times_as_long
+from benchmarks.report import Row, Settings, bars, compare, times_as_long
 from lw_torchrl.suites.metaworld.plain_engine import make_metaworld_env
-from lw_torchrl.suites.metaworld.simulated_rows import available_cores
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 CHUNK = 25  # steps that one contender makes before it is the next one's turn
@@ -130,89 +126,5 @@ def steps(settings: Settings) -> list[Row]:
             unit="µs",
             scale=scale,
             at_most=1.15,
-        ),
-    ]
-
-
-def threads(settings: Settings) -> list[Row]:
-    """Two threads against one, and the same for a loop of nothing but physics: what the machine can give."""
-    if available_cores() < 2:
-        raise Skipped("this process may use one core only")
-    rows = []
-    for copies in (1,) if settings.quick else (1, 4):
-        rows += _threads(lw.MT50[:4] if settings.quick else lw.MT50 * copies, settings)
-    return rows
-
-
-def _threads(tasks: tuple[str, ...], settings: Settings) -> list[Row]:
-    n = len(tasks)
-    engines = [VectorizedEngine(tasks, num_threads=count) for count in (1, 2)]
-    for engine in engines:
-        engine.reset(range(n), list(range(n)))
-    active = np.ones(n, dtype=bool)
-    generator = np.random.default_rng(0)
-    block = 10 if n <= 50 else 5
-    # A piece of the bare loop's work is the rows of one task, which share a model; a thread takes piece after piece.
-    pieces = []
-    for task in dict.fromkeys(tasks):
-        env = make_metaworld_env(task)
-        env.seed(0)
-        env.reset()
-        pieces.append([(env.model, copy(env.data)) for _ in range(tasks.count(task))])
-
-    def work_through(waiting: deque[list[tuple[Any, Any]]]) -> None:
-        while True:
-            try:
-                piece = waiting.popleft()
-            except IndexError:
-                return
-            for model, data in piece:
-                mujoco.mj_step(model, data, SUBSTEPS)
-                mujoco.mj_forward(model, data)
-
-    def alone() -> None:
-        for _ in range(block):
-            work_through(deque(pieces))
-
-    def in_two() -> None:
-        for _ in range(block):
-            waiting = deque(pieces)
-            other = pool.submit(work_through, waiting)
-            work_through(waiting)
-            other.result()
-
-    def step(engine: VectorizedEngine) -> None:
-        for action in actions:
-            engine.step(action, active)
-
-    found: dict[str, list[float]] = {name: [] for name in ("one", "two", "bare one", "bare two")}
-    with ThreadPoolExecutor(1) as pool:
-        for number in bars(range(settings.pick(20, 3)), f"threads, N = {n}"):
-            actions = generator.uniform(-1, 1, (block, n, 4)).astype(np.float32)
-            one, two = partial(step, engines[0]), partial(step, engines[1])
-            turns: dict[str, Callable[[], None]] = {"one": one, "two": two, "bare one": alone, "bare two": in_two}
-            for name in turns if number % 2 else reversed(turns):
-                found[name].append(timed(turns[name]))
-    for engine in engines:
-        engine.close()
-    scale = 1e6 / block / n
-    return [
-        compare(
-            f"engine step, N = {n}, 2 threads",
-            found["two"],
-            "1 thread",
-            found["one"],
-            unit="µs",
-            scale=scale,
-            at_least=1.6,
-        ),
-        compare(
-            f"bare physics, N = {n}, 2 threads",
-            found["bare two"],
-            "1 thread",
-            found["bare one"],
-            unit="µs",
-            scale=scale,
-            note="what this machine gains from a second thread",
         ),
     ]

@@ -74,6 +74,22 @@ def test_failing_benchmark_is_reported_and_the_others_continue(tmp_path, monkeyp
     assert "no benchmark goood" in capsys.readouterr().err
 
 
+@pytest.mark.slow
+def test_scaling_prints_each_row_and_continues_after_an_error(tmp_path, monkeypatch, capfd):
+    monkeypatch.setenv("OUT", str(tmp_path / "out"))
+    (tmp_path / "out").mkdir()
+    names = ["machine", "cloning-step", "few-shot-success", "exactness"]
+    assert cli.main(["scaling", "--quick", "--folder", str(tmp_path / "run"), "--rows", *names]) == 1
+    report = json.loads((tmp_path / "out" / "scaling.json").read_text("utf-8"))
+    rows = {row["row"]: row for row in report["rows"]}
+    assert rows["success of few-shot"]["error"] == "not trained"
+    assert rows["same bits"] == {"row": "same bits"} | dict.fromkeys(
+        ("repeated", "resumed", "eager", "resumed eager"), True
+    )
+    printed = capfd.readouterr().out
+    assert all(f'"row": "{name}"' in printed for name in rows)
+
+
 def test_rows_compare_medians_shares_and_factors_with_their_targets():
     for limit, met in ((1.9, True), (2.1, False), (None, None)):
         row = compare("x", [1.0, 2.0, 1.0], "y", [2.0, 4.0, 9.0], unit="ms", scale=1e3, at_least=limit)

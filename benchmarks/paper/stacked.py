@@ -22,6 +22,10 @@ from lw_torchrl.training.cloning import BehavioralCloningConfig
 from lw_torchrl.training.loop import Training, TrainingOptions, make_optimizer
 from lw_torchrl.training.minibatches import Minibatches, check_replay, describe_data, describe_replay
 from lw_torchrl.training.normalization import check_contacts, fit_normalization, statistics_of
+from lw_torchrl.transforms import FallbackTurns, JitterTarget, QAFTransform, RandomYaw
+
+_BY_ROW = (FallbackTurns, JitterTarget, QAFTransform, RandomYaw)
+"""Transforms that compute each row from this row alone."""
 
 
 def _check_actors(actors: Sequence[TensorDictModuleBase]) -> None:
@@ -41,7 +45,8 @@ class StackedBehavioralCloning(Training):
     """Train M actors, each on its own batches, as :class:`BehavioralCloningTrainer` trains one.
 
     One ``vmap`` computes all M actors. Each actor has the batches and augmentations that its seed gives it alone, so
-    that its losses are those it would have alone, up to rounding and the features' noise.
+    that its losses are those it would have alone, up to rounding and the features' noise; on a GPU, augmentations of
+    all actors draw from one seed.
 
     Args:
         actors: M policies with the same parts and plans and with their own weights, trained in place.
@@ -70,6 +75,7 @@ class StackedBehavioralCloning(Training):
         if not actors or len(replays) != len(actors):
             raise ValueError(f"replays must be as many as actors, at least one, got {len(replays)} and {len(actors)}")
         options.setdefault("title", f"training {len(actors)} models")
+        options.setdefault("capture", True)
         super().__init__(config, **options)
         self.actors = list(actors)
         self.module, self.networks = actors[0], [*actors]
@@ -90,7 +96,7 @@ class StackedBehavioralCloning(Training):
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
             actor.to(self.device)
             check_replay(actor, replay, config.batch_size)
-            self.minibatches.append(Minibatches(replay, config.batch_size, config.seed + number))
+            self.minibatches.append(Minibatches(replay, config.batch_size, config.seed + number, self.device))
             if config.normalize and statistics_of(actor):
                 fit_normalization(actor, replay)
             else:
@@ -103,6 +109,8 @@ class StackedBehavioralCloning(Training):
         self._act = vmap(
             lambda p, b, batch: functional_call(actors[0], (p, b), (batch,)).get("action"), randomness="different"
         )
+        transforms = [describe_replay(replay)["transforms"] for replay in replays]
+        self._are_alike = all(each == transforms[0] for each in transforms)
         self.optimizer = make_optimizer([(self._parameters.values(), config.learning_rate)], config, self.device)
         self.resume()
 
@@ -112,16 +120,23 @@ class StackedBehavioralCloning(Training):
     def contents(self) -> dict[str, Tensor]:
         return {**self.parameters(), **text_vectors(self.actors[0])}
 
-    def step(self) -> Tensor:
-        """Train every actor on one minibatch and return their losses, (M,) float32, on the device."""
-        first, *others = self.minibatches
-        batches = []
-        for minibatches in others:
-            with minibatches.drawing(self.device):
-                batches.append(minibatches.draw(self.device).exclude("next"))
-        with first.drawing(self.device):  # also the noise of all actors' features
-            batches.insert(0, first.draw(self.device).exclude("next"))
-            return self.train_on(torch.stack(batches))
+    def combined(self, drawn: list[TensorDictBase]) -> TensorDictBase:
+        return torch.stack([each.exclude("next") for each in drawn])
+
+    def batch(self, drawn: TensorDictBase) -> TensorDictBase:
+        sources = [each.indexed for each in self.minibatches]
+        if any(source is None for source in sources):
+            return drawn
+        pairs = list(zip(sources, drawn.unbind(0), strict=True))
+        if not self._are_alike:
+            return torch.stack([source.rows(own).exclude("next") for source, own in pairs])
+        rows = torch.stack([source.stored(own) for source, own in pairs])
+        for parts in zip(*(source.replay.transform for source in sources), strict=True):
+            if isinstance(parts[0], _BY_ROW):  # in one call for all models, which a GPU computes as fast as one
+                rows = parts[0](rows)
+            else:
+                rows = torch.stack([part(own) for part, own in zip(parts, rows.unbind(0), strict=True)])
+        return rows.exclude("next")
 
     def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
         actions = self._act(self._parameters, self._buffers, batch.exclude("action"))

@@ -71,11 +71,11 @@ def find_slow_parts() -> list[str]:
     cores, slow = available_cores(), []
     if find_kernel() is None:
         if importlib.util.find_spec("numba") is None:
-            slow.append("Conditions are checked without Numba: pip install 'lw_torchrl[fast]'.")
+            slow.append("Conditions and the simulation are not compiled: pip install 'lw_torchrl[fast]'.")
         else:
             slow.append("Numba has no writable cache folder: set NUMBA_CACHE_DIR to a writable folder.")
     elif os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
-        slow.append("NUMBA_DISABLE_JIT is set, so conditions are checked in uncompiled Python; unset the variable.")
+        slow.append("NUMBA_DISABLE_JIT is set, so conditions and the simulation are not compiled; unset the variable.")
     if cores == 1:
         slow.append("There is only one core: simulation, collection and evaluation use one thread per core.")
     if (total := os.cpu_count() or 1) > cores:

@@ -46,7 +46,11 @@ class DatasetStorage(TensorStorage):
         self.fingerprint = fingerprint
 
     def _rand_given_ndim(self, batch_size: int) -> Tensor:
-        return to_device_of(self, torch.randint(0, len(self), (batch_size,), generator=self._rng))
+        return to_device_of(self, self.draw(batch_size))
+
+    def draw(self, batch_size: int) -> Tensor:
+        """Draw the indices (B,) int64 of uniformly random rows, on the CPU."""
+        return torch.randint(0, len(self), (batch_size,), generator=self._rng)
 
     def get(self, index: Any) -> TensorDict:
         """Return the rows at an index in a new TensorDict: views for a slice, copies for any other index."""

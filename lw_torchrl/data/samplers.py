@@ -10,6 +10,7 @@ from math import gcd, isclose
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import NestedKey
 from torch import Tensor
@@ -117,8 +118,8 @@ class GroupSampler(Sampler):
         self._length, self._laid_out, self._restored = self._covered(storage), None, False
         keys = self._keys(storage, self._order[self._start()]) if storage.ndim == 1 else None
         self._written, self._known = [], None if keys is None else keys.reshape(-1).cpu()
-        for group in range(len(self._size)):
-            self._shuffle(group)
+        for group, (start, size) in enumerate(zip(self._start().tolist(), self._size.tolist(), strict=True)):
+            self._shuffle(group, start, size)
 
     def _move_written(self, storage: Storage) -> bool:
         """Move newly written rows to the passes of their groups; return False if all rows must be grouped again."""
@@ -155,26 +156,22 @@ class GroupSampler(Sampler):
     def _start(self) -> Tensor:
         return self._size.cumsum(0) - self._size
 
-    def _shuffle(self, group: int) -> None:
-        start, size = int(self._start()[group]), int(self._size[group])
-        rows = self._order[start : start + size]
-        self._order[start : start + size] = rows[torch.randperm(size, generator=self._rng)]
+    def _shuffle(self, group: int, start: int, size: int) -> None:
+        order = self._order.numpy()
+        order[start : start + size] = order[start : start + size][torch.randperm(size, generator=self._rng).numpy()]
         self._cursor[group] = 0
 
-    def _take(self, group: int, count: int) -> tuple[Tensor, bool]:
+    def _take(self, group: int, start: int, size: int, count: int) -> tuple[np.ndarray, bool]:
         """Draw ``count`` rows of a group, starting new passes as needed; also return whether a pass ended."""
-        parts, ended = [], False
-        start, size = int(self._start()[group]), int(self._size[group])
+        order, cursor, parts, ended = self._order.numpy(), int(self._cursor[group]), list[np.ndarray](), False
         while count:
-            cursor = int(self._cursor[group])
-            rows = self._order[start + cursor : start + min(size, cursor + count)].clone()
-            parts.append(rows)
-            self._cursor[group] += len(rows)
-            count -= len(rows)
-            if self._cursor[group] == size:
-                ended = True
-                self._shuffle(group)
-        return torch.cat(parts), ended
+            parts.append(order[start + cursor : start + min(size, cursor + count)].copy())
+            cursor, count = cursor + len(parts[-1]), count - len(parts[-1])
+            if cursor == size:
+                ended, cursor = True, 0
+                self._shuffle(group, start, size)
+        self._cursor[group] = cursor
+        return np.concatenate(parts), ended
 
     def _layout(self, batch_size: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return the number of rows in each group (G,) and, for each batch row, its group (B,) and its index within
@@ -213,6 +210,13 @@ class GroupSampler(Sampler):
 
     @typed
     def sample(self, storage: Storage, batch_size: Count) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
+        index, info = self.draw(storage, batch_size)
+        info = {name: to_device_of(storage, value) for name, value in info.items()}
+        index = to_device_of(storage, index)
+        return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), info
+
+    def draw(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        """Draw the indices (B,) int64 of a batch, counted along the flattened storage, on the CPU."""
         worker = get_worker_info()
         if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
             raise RuntimeError(
@@ -225,23 +229,25 @@ class GroupSampler(Sampler):
             self._check_restored(storage)
         if (self._written or self._covered(storage) != self._length) and not self._move_written(storage):
             self._group(storage)
-        shares, group, place = self._layout(batch_size)
-        at = (self._start() + self._cursor)[group].add_(place).clamp_(max=len(self._order) - 1)
-        index = self._order[at]
+        # NumPy takes a third of PyTorch's time for so few numbers.
+        shares, group, place = (part.numpy() for part in self._layout(batch_size))
+        order, size, cursor = self._order.numpy(), self._size.numpy(), self._cursor.numpy()
+        starts = size.cumsum() - size
+        index = order.take((starts + cursor)[group] + place, mode="clip")
         self.ran_out = False
         # Most batches end no pass, so one gather draws them. Rows of groups whose pass ends are replaced below.
-        ending = self._cursor + shares >= self._size
-        self._cursor += torch.where(ending, 0, shares)
-        if ending.any():
-            batches = self._size / self._weight
-            longest = batches == batches.max()
-            first = shares.cumsum(0) - shares
-            for number in ending.nonzero().flatten().tolist():
-                rows, ended = self._take(number, int(shares[number]))
+        ending = cursor + shares >= size
+        ended = ending.nonzero()[0].tolist()
+        cursor += shares
+        if ended:
+            cursor[ended] -= shares[ended]
+            batches = size / self._weight.numpy()
+            longest, first = batches.max(), shares.cumsum() - shares
+            for number in ended:
+                rows, is_over = self._take(number, int(starts[number]), int(size[number]), int(shares[number]))
                 index[first[number] : first[number] + len(rows)] = rows
-                self.ran_out |= ended and bool(longest[number])
-        index = to_device_of(storage, index)
-        return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), {}
+                self.ran_out |= is_over and bool(batches[number] == longest)
+        return torch.from_numpy(index), {}
 
     def add(self, index: Any, *, storage: Storage | None = None) -> None:
         """Register rows that were written, possibly through another buffer with the same storage."""
@@ -432,11 +438,10 @@ class CoLearningSampler(GroupSampler):
         reason = f"so that {self.target_fraction} of it is from the target and {base} base tasks share the rest equally"
         return [part * base] + [whole - part] * base, reason
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
-        index, info = super().sample(storage, batch_size)
+    def draw(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        index, info = super().draw(storage, batch_size)
         assert self._laid_out is not None
-        info["is_target"] = to_device_of(storage, self._laid_out[2] == 0)
-        return index, info
+        return index, info | {"is_target": self._laid_out[2] == 0}
 
     def _identity(self) -> dict[str, Tensor]:
         fraction = torch.tensor([self.target_fraction.numerator, self.target_fraction.denominator])

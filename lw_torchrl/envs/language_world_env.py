@@ -18,7 +18,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
 from lw_torchrl._util.checks import Count, Natural, check_value, typed
-from lw_torchrl._util.devices import check_device
+from lw_torchrl._util.devices import CPU, check_device, copied_at_once
 from lw_torchrl._util.keys import row_mask
 from lw_torchrl._util.rendering import check_picture
 from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec
@@ -217,7 +217,8 @@ class LanguageWorldEnv(EnvBase):
         return self._output(self._rows.as_tensordict())
 
     def _output(self, rows: TensorDict) -> TensorDict:
-        return (rows if self.batch_size else rows[0]).to(self.device)
+        rows = rows if self.batch_size else rows[0]
+        return rows if self.device == CPU else copied_at_once(rows, self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._check_process()

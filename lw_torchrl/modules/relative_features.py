@@ -274,7 +274,7 @@ class RoleFeatures(_RelativePositions):
         acting = (self.attention.weights(truth, at) * self.acts[at]).sum(-1) > 0.5
         hand, first, *_ = self.layout.positions
         contacts = observation[:, hand] - observation[:, first]
-        for row in at[acting].unique().tolist():
+        for row in at[acting].unique().cpu().tolist():
             self.contact[row] = contacts[acting & (at == row)].median(0).values
         self.demonstrated[at.unique()] = True
         self.fitted.fill_(True)

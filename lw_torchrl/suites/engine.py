@@ -60,7 +60,7 @@ def checked_step(
         raise ValueError(f"action must have shape {(n, size)} and active {(n,)}, got {action.shape}, {active.shape}")
     if not started[active].all():
         row = int(np.flatnonzero(active & ~started)[0])
-        raise RuntimeError(f"row {row} must be reset before the first step")
+        raise RuntimeError(f"row {row} must be reset before the first step, and after a step that was interrupted")
     return action, active
 
 

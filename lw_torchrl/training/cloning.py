@@ -152,7 +152,7 @@ class BehavioralCloningTrainer(Training):
             self.description |= {"data": describe_data(replay), "replay": describe_replay(replay)}
         self.loss = bc_loss(actor, config.loss_function)
         self.optimizer = make_optimizer([(self.loss.parameters(), config.learning_rate)], config, self.device)
-        self.minibatches = [Minibatches(replay, config.batch_size, config.seed)]
+        self.minibatches = [Minibatches(replay, config.batch_size, config.seed, self.device)]
         if self.resume():  # the checkpoint includes the normalization statistics
             return
         if config.normalize and statistics_of(actor):

@@ -54,12 +54,24 @@ class _StateQueries:
 
     def sample(self, size: int) -> TensorDictBase:
         """Draw ``observation`` (B, 39) float32, ``clauses`` (B, 1) and the clauses' ``truth`` (B, 1) float32."""
+        return self.rows(self.draw(size))
+
+    def draw(self, size: int) -> TensorDict:
+        """Draw the indices of B states and clauses, and the clauses' truth, (B,) each, on the CPU."""
         # Cycle through the groups from a random start, so that a batch smaller than their number favors none.
         group = (torch.arange(size) + torch.randint(len(self.sizes), ())) % len(self.sizes)
         place = (torch.rand(size, dtype=torch.float64) * self.sizes[group]).long()
         row, clause = self.pairs[self.starts[group] + place].long().unbind(-1)
-        truth, clauses = self.truths[group][:, None].float(), self.clauses.pick(clause[:, None])
-        return TensorDict(observation=self.observation[row], truth=truth, clauses=_as_tensordict(clauses))
+        return TensorDict(row=row, clause=clause, truth=self.truths[group])
+
+    def rows(self, drawn: TensorDictBase) -> TensorDictBase:
+        """Return the minibatch for what :meth:`draw` returned, on its device."""
+        truth, clauses = drawn["truth"][:, None].float(), self.clauses.pick(drawn["clause"][:, None])
+        return TensorDict(observation=self.observation[drawn["row"]], truth=truth, clauses=_as_tensordict(clauses))
+
+    def to(self, device: torch.device) -> None:
+        """Move the states and clauses to a device."""
+        self.observation, self.clauses = self.observation.to(device), _on(self.clauses, device)
 
     @staticmethod
     def loss(network: Any, batch: TensorDictBase, config: Any) -> Tensor:
@@ -74,6 +86,7 @@ class _PictureQueries:
         for task in tasks:
             evaluator.check_seen(task.view("pixels"))
         self.tasks = tasks
+        self.pixels, self.truths = [task.view("pixels") for task in tasks], [task.truth for task in tasks]
         self.clauses = [evaluator.code([(task.task, clause) for clause in task.clauses]) for task in tasks]
         self.weights = [_answer_weights(task) for task in tasks]
         self.positions = [_known_positions(task, evaluator.names) for task in tasks]
@@ -81,21 +94,37 @@ class _PictureQueries:
 
     def sample(self, size: int) -> TensorDictBase:
         """Draw about ``size`` states in total, as one nested TensorDict per task with the same number of states."""
+        return self.rows(self.draw(size))
+
+    def draw(self, size: int) -> TensorDict:
+        """Draw the indices (B,) of each task's states, on the CPU."""
         each = max(1, size // len(self.tasks))
+        return TensorDict({task.task.name: torch.randint(len(task.observation), (each,)) for task in self.tasks})
+
+    def rows(self, drawn: TensorDictBase) -> TensorDictBase:
+        """Return the minibatch for what :meth:`draw` returned, on its device."""
         batch = TensorDict()
-        for number, task in enumerate(self.tasks):
-            rows, clauses = torch.randint(len(task.observation), (each,)), self.clauses[number]
+        for number, (task, pixels, truth) in enumerate(zip(self.tasks, self.pixels, self.truths, strict=True)):
+            rows, clauses = drawn[task.task.name], self.clauses[number]
             objects, positions, known = self.positions[number]
+            every = torch.arange(len(clauses.predicate), device=rows.device).expand(len(rows), -1)
             batch[task.task.name] = TensorDict(
-                pixels=task.view("pixels")[rows],
-                truth=task.truth[rows].float(),
-                weights=self.weights[number].gather(0, task.truth[rows].long()),
-                clauses=_as_tensordict(clauses.pick(torch.arange(len(clauses.predicate)).expand(each, -1))),
+                pixels=pixels[rows],
+                truth=truth[rows].float(),
+                weights=self.weights[number].gather(0, truth[rows].long()),
+                clauses=_as_tensordict(clauses.pick(every)),
                 objects=objects,
                 positions=positions[rows],
                 known=known,
             )
         return batch
+
+    def to(self, device: torch.device) -> None:
+        """Move the pictures, answers and clauses to a device."""
+        for name in ("pixels", "truths", "weights"):
+            setattr(self, name, [tensor.to(device) for tensor in getattr(self, name)])
+        self.clauses = [_on(clauses, device) for clauses in self.clauses]
+        self.positions = [(a.to(device), b.to(device), c.to(device)) for a, b, c in self.positions]
 
     @staticmethod
     def loss(network: Any, batch: TensorDictBase, config: Any) -> Tensor:
@@ -115,6 +144,10 @@ class _PictureQueries:
 
 def _as_tensordict(clauses: Clauses) -> TensorDict:
     return TensorDict(dict(zip(Clauses._fields[:7], clauses[:7], strict=True)))
+
+
+def _on(clauses: Clauses, device: torch.device) -> Clauses:
+    return Clauses(*(table.to(device) for table in clauses))
 
 
 def _known_positions(queries: TaskQueries, names: tuple[str, ...]) -> tuple[Tensor, Tensor, Tensor]:
@@ -163,7 +196,7 @@ class QueryEvaluatorTrainer(Training):
         evaluator: the evaluator, trained in place; the evaluator's plans do not affect training.
         data: the queries and their answers, some of which are held out.
         config: the config from which ``data`` was built; pictures require an :class:`ImageQueryEvaluatorConfig`.
-        device: the device to train on, see :class:`BehavioralCloningTrainer`.
+        device: the device to train on, see :class:`BehavioralCloningTrainer`; states and pictures are kept there.
         **options: keyword arguments of :class:`~lw_torchrl.training.loop.Training`, which also lists their errors.
             :func:`load_evaluator` reads the checkpoint.
 
@@ -219,7 +252,8 @@ class QueryEvaluatorTrainer(Training):
         else:
             queries = _StateQueries(evaluator, tasks)
         self._loss = queries.loss
-        self.minibatches = [Minibatches(queries, config.batch_size, config.seed)]
+        queries.to(self.device)
+        self.minibatches = [Minibatches(queries, config.batch_size, config.seed, self.device)]
         trained = [parameter for parameter in evaluator.parameters() if parameter.requires_grad]
         self.optimizer = make_optimizer([(trained, config.learning_rate)], config, self.device)
         if self.checkpoint is not None:

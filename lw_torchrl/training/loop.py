@@ -20,6 +20,7 @@ from lw_torchrl._util.checks import Count, check_value, typed
 from lw_torchrl._util.devices import CPU
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.progress import Progress
+from lw_torchrl.training.captured import CapturedFunction, captures, foreign_code
 from lw_torchrl.training.checkpoint import CheckpointFiles, check_finite, contents_of
 from lw_torchrl.training.minibatches import Minibatches
 from lw_torchrl.training.normalization import share_contacts
@@ -35,7 +36,7 @@ def make_optimizer(
 
     On a CUDA device the learning rates are tensors, so that a CUDA graph can capture the optimizer step.
     """
-    on_gpu = device.type == "cuda"
+    on_gpu = captures(device)
     groups: list[dict[str, Any]] = []
     for parameters, rate in rates:
         initial = float(rate)
@@ -47,14 +48,16 @@ def make_optimizer(
     return torch.optim.AdamW(groups, weight_decay=config.weight_decay, fused=True, capturable=on_gpu)
 
 
-def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int) -> None:
-    """Set the learning rates after ``step`` optimizer steps: a cosine schedule from the initial value to 0, or
-    constant.
-    """
+def _rate_factor(config: Any, step: int) -> float:
+    """Return the fraction of the initial learning rate after ``step`` optimizer steps: a cosine to 0, or 1."""
     is_constant = getattr(config, "schedule", "cosine") == "constant"
-    factor = 1.0 if is_constant else 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
+    return 1.0 if is_constant else 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
+
+
+def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int) -> None:
+    """Set the learning rates after ``step`` optimizer steps."""
     for group in optimizer.param_groups:
-        rate = group["initial_lr"] * factor
+        rate = group["initial_lr"] * _rate_factor(config, step)
         if isinstance(group["lr"], Tensor):
             group["lr"].fill_(rate)
         else:
@@ -118,6 +121,7 @@ class TrainingOptions(TypedDict, total=False):
     logger: Logger | None
     progress: bool
     title: str
+    capture: bool | None
 
 
 class Training:
@@ -132,6 +136,10 @@ class Training:
         evaluate_every: call ``evaluate`` every N minibatches and after the last, with the networks in eval mode.
         logger: a TorchRL logger, which receives the mean losses of every 100 minibatches as ``train/NAME``.
         progress, title: whether to show a progress bar, and the title of the progress bar.
+        capture: run the training step on a CUDA device as one CUDA graph, which repeats the kernels of the third step
+            without running Python. None captures steps of modules from torch, torchrl, tensordict and this library;
+            True also captures other classes, which must not change Python attributes from step to step. If a step
+            cannot be captured, a warning says why, and training continues without a graph.
 
     Attributes:
         module, optimizer: the module that contains all trained parameters, and their optimizer.
@@ -167,6 +175,7 @@ class Training:
         logger: Logger | None = None,
         progress: bool = True,
         title: str = "training",
+        capture: bool | None = None,
     ) -> None:
         if (evaluate is None) != (evaluate_every is None):
             raise ValueError("evaluate and evaluate_every must be given together")
@@ -176,24 +185,51 @@ class Training:
         self.steps, self.last, self.description = 0, dict[str, float](), dict[str, Any]()
         self.minibatches: list[Minibatches] = []
         self._values: deque[dict[str, Tensor]] = deque(maxlen=READ_EVERY)
+        self.capture = capture
+        self._captured: CapturedFunction | None = None
 
     def losses(self, batch: Any) -> Mapping[str, Tensor]:
         """Return a minibatch's loss terms, whose names begin with "loss" and which are added, and values to log."""
         raise NotImplementedError(f"{type(self).__name__} must implement losses")
 
     def step(self) -> Tensor:
-        """Train on one minibatch and return the loss () float32, which the device may still be computing."""
-        (minibatches,) = self.minibatches
-        with minibatches.drawing(self.device):
-            return self.train_on(minibatches.draw(self.device))
+        """Train on one minibatch; return the loss () float32, or (M,) for M models, which the device may still compute.
 
-    def train_on(self, batch: Any) -> Tensor:
-        """Train on a given minibatch and return the loss () float32, or the losses (M,) float32 of M models."""
-        values = self.update(batch)
+        The networks' random numbers are those of the first of :attr:`minibatches`.
+        """
+        first, *others = self.minibatches
+        drawn = []
+        for minibatches in others:
+            with minibatches.drawing(self.device):
+                drawn.append(minibatches.draw())
+        with first.drawing(self.device):
+            values = self._run(self.combined([first.draw(), *drawn]))
         self.steps += 1
         _set_learning_rates(self.optimizer, self.config, self.steps)
         self._values.append(values)
         return values["loss"]
+
+    def _run(self, drawn: Any) -> dict[str, Tensor]:
+        """Run :meth:`update` on what was drawn, on a CUDA device as one CUDA graph."""
+        if self._captured is None:
+            captured = CapturedFunction(lambda each: self.update(self.batch(each)), self.device)
+            parts = [self, self.module, *self.networks]
+            parts += [getattr(each.source, "transform", None) for each in self.minibatches]
+            if self.capture is False:
+                captured.tries = False
+            elif self.capture is None and captured.tries and (name := foreign_code(parts)):
+                captured.give_up(f"{name} may change its attributes from step to step; if not, use capture=True")
+            self._captured = captured
+        return self._captured(drawn, tuple(network.training for network in self.networks))
+
+    def combined(self, drawn: list[Any]) -> Any:
+        """Combine what was drawn from each of :attr:`minibatches`."""
+        (only,) = drawn
+        return only
+
+    def batch(self, drawn: Any) -> Any:
+        """Return the minibatch for what :meth:`combined` returned, now on the device."""
+        return self.minibatches[0].rows(drawn)
 
     def update(self, batch: Any) -> dict[str, Tensor]:
         """Run one optimizer step and return the detached values to log.
@@ -275,7 +311,8 @@ class Training:
         if logs or saves:
             self._read_losses()
         if logs:
-            self._log("train", {**self.last, "learning_rate": float(self.optimizer.param_groups[0]["lr"])})
+            rate = self.optimizer.param_groups[0]["initial_lr"] * _rate_factor(self.config, self.steps)
+            self._log("train", {**self.last, "learning_rate": rate})
             bar.note(**{name: f"{value:.4f}" for name, value in self.last.items() if "loss" in name})
         if saves:
             self.save()
@@ -334,6 +371,10 @@ class Training:
         """Restore a state returned by :meth:`state_dict`."""
         for minibatches, stored in zip(self.minibatches, state["minibatches"], strict=True):
             minibatches.load_state_dict(stored)
+        rates = [group["lr"] for group in self.optimizer.param_groups]
         self.optimizer.load_state_dict(state["optimizer"])
+        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate  # on a GPU a tensor there, which the state holds on the CPU
+        self._captured = None  # a CUDA graph would use the old state
         self.steps = state["step"]
         _set_learning_rates(self.optimizer, self.config, self.steps)

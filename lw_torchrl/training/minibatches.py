@@ -7,9 +7,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from torch import nn
-from torchrl.data import TensorDictReplayBuffer
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
+from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import Compose, Transform
 from torchrl.objectives import BCLoss, LossModule
 
@@ -29,11 +31,15 @@ class Minibatches:
     """A source of minibatches drawn from a replay buffer, or from any object with a method ``sample(size)``.
 
     The random numbers of sampler, transforms and networks depend only on the seed and the index of the minibatch.
-    Samplers draw on the CPU, so minibatches are the same on every device.
+    Samplers draw on the CPU, so minibatches are the same on every device. If the rows are on a GPU, only their indices
+    are drawn on the CPU, and a CUDA graph can contain the rest.
     """
 
-    def __init__(self, source: Any, size: int, seed: int) -> None:
+    def __init__(self, source: Any, size: int, seed: int, device: torch.device = CPU) -> None:
         self.source, self.size, self.seed, self.step = source, size, seed, 0
+        self._indexed: Any = None
+        if device != CPU:
+            self._indexed = source if hasattr(source, "draw") else IndexedReplay.of(source, device)
         if hasattr(source, "set_rng"):
             source.set_rng(torch.default_generator)  # the generator that `drawing` seeds
 
@@ -45,10 +51,18 @@ class Minibatches:
             self.step += 1
             yield
 
-    def draw(self, device: torch.device) -> Any:
-        """Draw a minibatch and copy it to the device without waiting for the copy."""
-        batch = self.source.sample(self.size)
-        return batch if device == CPU else batch.to(device, non_blocking=True)
+    def draw(self) -> Any:
+        """Draw a minibatch; or, if the rows are on a GPU, only their indices, on the CPU."""
+        return self.source.sample(self.size) if self._indexed is None else self._indexed.draw(self.size)
+
+    @property
+    def indexed(self) -> Any:
+        """The source that :meth:`draw` draws only indices of; None if it draws whole minibatches."""
+        return self._indexed
+
+    def rows(self, drawn: Any) -> Any:
+        """Return the minibatch for what :meth:`draw` returned, which must be on the device."""
+        return drawn if self._indexed is None else self._indexed.rows(drawn)
 
     def state_dict(self) -> dict[str, Any]:
         sampler = getattr(self.source, "sampler", None)
@@ -58,6 +72,53 @@ class Minibatches:
         self.step = state["step"]
         if state["sampler"]:
             self.source.sampler.load_state_dict(state["sampler"])
+
+
+class IndexedReplay:
+    """A replay buffer with rows on a GPU, whose minibatches are made in two parts: indices on the CPU, then rows."""
+
+    def __init__(self, replay: TensorDictReplayBuffer) -> None:
+        self.replay, self._given = replay, _GivenRows()
+
+    @classmethod
+    def of(cls, source: Any, device: torch.device) -> IndexedReplay | None:
+        """Return the replay buffer as such a source, or None if its rows are elsewhere or its indices need the rows."""
+        if not isinstance(source, TensorDictReplayBuffer) or not isinstance(source.storage, TensorStorage):
+            return None
+        is_here = device_of_rows(source.storage) == device and source.storage.ndim == 1
+        has_draw = isinstance(source.sampler, GroupSampler) or (
+            isinstance(source.storage, DatasetStorage) and type(source.sampler) is RandomSampler
+        )
+        return cls(source) if is_here and has_draw else None
+
+    def draw(self, size: int) -> TensorDict:
+        """Draw the sampler's ``index`` and other information, (B,) each, on the CPU."""
+        sampler, storage = self.replay.sampler, self.replay.storage
+        index, more = sampler.draw(storage, size) if isinstance(sampler, GroupSampler) else (storage.draw(size), {})
+        return TensorDict({"index": index, **more}, [size])
+
+    def stored(self, drawn: TensorDictBase) -> TensorDictBase:
+        """Return the rows at the indices, without the buffer's transforms."""
+        return self.replay.storage.get(drawn.get("index")).update(drawn)
+
+    def rows(self, drawn: TensorDictBase) -> TensorDictBase:
+        """Return the rows at the indices, with the buffer's transforms applied."""
+        sampler, self._given.rows = self.replay.sampler, drawn
+        self.replay._sampler = self._given
+        try:
+            return self.replay.sample(len(drawn))
+        finally:
+            self.replay._sampler = sampler
+
+
+class _GivenRows(RandomSampler):
+    """A sampler that returns given indices."""
+
+    rows: TensorDictBase
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        more = {key: value for key, value in self.rows.items() if key != "index"}
+        return self.rows.get("index"), more
 
 
 def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, size: int) -> None:

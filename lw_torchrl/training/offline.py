@@ -169,7 +169,7 @@ class OfflineTrainer(Training):
         check_minibatches(self.networks, replay, config.batch_size)
         check_augmentations(loss, self.networks, replay)
         getattr(loss, "target_entropy", None)  # SACLoss registers this buffer on first access
-        self.minibatches = [Minibatches(replay, config.batch_size, config.seed)]
+        self.minibatches = [Minibatches(replay, config.batch_size, config.seed, self.device)]
         delayed = any(name.startswith("target_") and name.endswith("_params") for name, _ in loss.named_children())
         self.targets = SoftUpdate(loss, eps=config.target_eps) if delayed else None
         groups: dict[bool, list[Tensor]] = {True: [], False: []}

@@ -116,6 +116,7 @@ class SwapUnmentioned(PlanAugmentation):
     """
 
     mentioned: Tensor
+    owner: Tensor
 
     @typed
     def __init__(self, plans: AnyPlans, probability: Probability, *, in_keys: Keys | None = None) -> None:
@@ -123,8 +124,12 @@ class SwapUnmentioned(PlanAugmentation):
         super().__init__(in_keys=keys, out_keys=keys[:1])
         self.probability = probability
         plans = self._read_plans(plans)
-        self._parts = plans.layout.parts
         self.register_buffer("mentioned", mentioned(plans, self._tables), persistent=False)  # (T, S, P) bool
+        owner = torch.full((plans.layout.size,), len(plans.layout.parts))
+        for item, parts in enumerate(plans.layout.parts):  # an object may have several parts, such as its old position
+            for part in parts:
+                owner[part] = item
+        self.register_buffer("owner", owner, persistent=False)  # (D,) int64, P for numbers that belong to no object
 
     def _kept(self, tensordict: TensorDictBase) -> Tensor:
         """Return whether each object, and the goal, keeps its position, (B, P) bool."""
@@ -145,16 +150,16 @@ class SwapUnmentioned(PlanAugmentation):
                 kept = kept | self._kept(following.copy().set(task, tensordict.get(task)))
         kept = kept.reshape(-1, kept.shape[-1])
         number, device = kept.shape[0], kept.device
-        flat = {name: values.reshape(number, -1) for name, values in observations.items()}
-        swapped = {name: values.clone() for name, values in flat.items()}
-        for item, parts in enumerate(self._parts):  # an object may have several parts, such as its old position
-            swap = (~kept[:, item] & (torch.rand(number, device=device) < self.probability)).unsqueeze(-1)
-            others = torch.randint(number, (number,), device=device)
-            for name, values in flat.items():
-                for part in parts:
-                    swapped[name][:, part] = torch.where(swap, values[others, part], values[:, part])
-        for name, values in swapped.items():
-            tensordict.set(name, values.reshape(observations[name].shape))
+        swaps, rows = [], []
+        for item in range(kept.shape[-1]):
+            swaps.append(~kept[:, item] & (torch.rand(number, device=device) < self.probability))
+            rows.append(torch.randint(number, (number,), device=device))
+        owner = self.table("owner", device)
+        swap = torch.stack([*swaps, torch.zeros_like(swaps[0])], -1).index_select(-1, owner)  # (n, D)
+        row = torch.stack([*rows, rows[0]], -1).index_select(-1, owner)
+        for name, values in observations.items():
+            flat = values.reshape(number, -1)
+            tensordict.set(name, torch.where(swap, flat.gather(0, row), flat).reshape(values.shape))
         return tensordict
 
 

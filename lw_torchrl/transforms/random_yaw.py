@@ -8,6 +8,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lw_torchrl._util.checks import Probability, Scale, missing_keys, typed
+from lw_torchrl._util.devices import plain
 from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans
@@ -18,13 +19,26 @@ from lw_torchrl.transforms.augmentation import PlanAugmentation, role_table
 _KEYS = ("observation", "action", "expert_action", "unclipped_action")
 
 
+_places: dict[tuple[tuple[int, ...], torch.device], Tensor] = {}
+
+
+def _places_on(starts: tuple[int, ...], device: torch.device) -> Tensor:
+    """Return the indices (2P,) int64 of all x, then of all y, for P pairs; the tensor is made once for each device."""
+    if (places := _places.get((starts, device))) is None:
+        with torch.inference_mode(False):  # autograd rejects tensors that were created in inference mode
+            places = torch.tensor([*starts, *(start + 1 for start in starts)]).to(device)
+        if plain(places):
+            _places[starts, device] = places
+    return places
+
+
 def _turned(values: Tensor, starts: tuple[int, ...], cos: Tensor, sin: Tensor) -> Tensor:
-    turned = values.clone()
-    for start in starts:
-        x, y = values[..., start], values[..., start + 1]
-        turned[..., start] = cos * x - sin * y
-        turned[..., start + 1] = sin * x + cos * y
-    return turned
+    """Rotate the pairs (x, y) that begin at ``starts`` in ``values`` (..., D), all of them in a few operations."""
+    places = _places_on(starts, values.device)
+    x, y = values.index_select(-1, places).split(len(starts), -1)
+    cos, sin = cos.unsqueeze(-1), sin.unsqueeze(-1)
+    turned = torch.cat((cos * x - sin * y, sin * x + cos * y), -1)
+    return values.index_copy(-1, places, turned.to(values.dtype))
 
 
 def turn_observation(observation: Tensor, angle: Tensor, layout: Layout = METAWORLD) -> Tensor:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl._util.devices import CPU, check_device, device_of
@@ -117,3 +118,37 @@ def test_gpu_is_never_waited_for(demos, tmp_path):
     on_cpu = lw.evaluate(lw.load_actor(tmp_path / "cuda.safetensors"), record_actions=True, **options)
     for episode, other in zip(on_gpu.episodes, on_cpu.episodes, strict=True):
         assert (episode.actions - other.actions).abs().max() < 1e-2
+
+
+@needs_a_gpu
+def test_gpu_steps_are_captured_and_resume_bit_for_bit(demos, tmp_path):
+    config = lw.BehavioralCloningConfig(steps=16, batch_size=10)
+
+    def train(path=None, until=None, capture=None):
+        torch.manual_seed(0)
+        replay = make_replay(demos, "cuda")
+        replay.append_transform(lw.RandomYaw(0.3, plans=PLANS))
+        actor = lw.PlanConditionedActor(PLANS, features=lw.modules.ObservationFeatures(noise=0.1))
+        options = {"checkpoint": path, "progress": False, "device": "cuda", "capture": capture}
+        trainer = lw.BehavioralCloningTrainer(actor, replay, config, **options)
+        trainer.train(until=until)
+        assert trainer._captured.is_captured is (capture is not False)
+        return dict(actor.cpu().named_parameters())
+
+    whole = train()
+    train(tmp_path / "p.safetensors", until=8)
+    for other in (train(tmp_path / "p.safetensors"), train(capture=False)):
+        assert all(torch.equal(value, whole[name]) for name, value in other.items())
+
+
+@needs_a_gpu
+def test_gpu_environment_equals_the_cpus():
+    found = []
+    for device in ("cuda", "cpu"):
+        env = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], max_steps=9, device=device), lw.QAFTransform(PLANS))
+        actor = lw.ScriptedSkillActor(PLANS).to(device)
+        rollout = env.rollout(12, actor, break_when_any_done=False)
+        assert {value.device.type for value in rollout.values(True, True)} == {device}
+        found.append(rollout.cpu())
+        env.close()
+    torch.testing.assert_close(found[0]["next", "observation"], found[1]["next", "observation"], atol=1e-4, rtol=0.0)

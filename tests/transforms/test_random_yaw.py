@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs import Compose
 
 import lw_torchrl as lw
+from lw_torchrl.language.layout import METAWORLD, places
 from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
 
 PLACES = [slice(start, start + 2) for start in (0, 4, 11, 18, 22, 29, 36)]
@@ -87,6 +88,17 @@ def test_action_outside_the_box_keeps_its_length():
     lengths = [td["action"][:, :2].norm(dim=-1)[outside] for td in (was, now)]
     torch.testing.assert_close(*lengths)
     assert now["action"][~outside][:, :2].abs().max() <= 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_positions_are_rotated_to_the_bit_as_one_at_a_time(dtype):
+    observation, angle = torch.randn(7, 39, dtype=dtype), torch.randn(7)
+    expected = observation.clone()
+    for x, y, _ in (places(part) for part in METAWORLD.all_positions):
+        old_x, old_y = observation[:, x], observation[:, y]
+        expected[:, x] = angle.cos() * old_x - angle.sin() * old_y
+        expected[:, y] = angle.sin() * old_x + angle.cos() * old_y
+    assert torch.equal(turn_observation(observation, angle), expected)
 
 
 def test_turned_actions_inside_the_box_to_the_bit():

@@ -19,6 +19,7 @@ from lw_torchrl._util.checks import Count, check_choice, typed
 from lw_torchrl._util.rendering import naming_absent_renderer
 from lw_torchrl.suites.engine import BodyPoses, RowModel
 from lw_torchrl.suites.fetch import FETCH
+from lw_torchrl.suites.metaworld.compiled_rows import addresses_of
 from lw_torchrl.suites.metaworld.observation import Array, Index, Mask
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
 from lw_torchrl.suites.metaworld.simulated_rows import ThreadedEngine
@@ -61,8 +62,10 @@ CAMERAS = ("external_camera_0", "head_camera_rgb", "gripper_camera_rgb", "lidar"
 """Names of the cameras in Fetch's scenes."""
 
 _NOW = FETCH.past or 0  # number of values in an observation that describe the current time step
-_READ = 12  # grip site (3), finger joints (2), object site (3) and object quaternion (4), in Fetch's axes
-_FINGERS = ("robot0:r_gripper_finger_joint", "robot0:l_gripper_finger_joint")
+# Columns of the numbers that are read from the state, in Fetch's axes.
+_GRIP, _FINGERS, _OBJECT, _QUATERNION = slice(0, 3), slice(3, 5), slice(5, 8), slice(8, 12)
+_HAND, _HAND_QUATERNION, _DRIVEN = slice(12, 15), slice(15, 19), slice(19, 21)
+_FINGER_JOINTS = ("robot0:r_gripper_finger_joint", "robot0:l_gripper_finger_joint")
 _TURN = np.array([1.0, 0.0, 1.0, 0.0])  # gymnasium-robotics adds this to the hand's quaternion: fingers down
 _METRES = 0.05  # metres per unit of displacement
 _SUCCESS = 0.05  # maximum distance to the goal at success, metres
@@ -113,45 +116,54 @@ class _Row:
 
         hand = self._model.body("robot0:gripper_link").id
         self.bodies = BodyPoses(data.xpos, data.xquat)  # views of the current state
-        self._hand = data.xpos[hand], data.xquat[hand]
         self._mocap = data.mocap_pos[0], data.mocap_quat[0]
-        self._fingers = [int(self._model.joint(name).qposadr[0]) for name in _FINGERS]
+        fingers = [int(self._model.joint(name).qposadr[0]) for name in _FINGER_JOINTS]
+        self._fingers = [data.qpos[finger : finger + 1] for finger in fingers]
         # The joints that actuators drive; controls are relative to the joint positions. Two tasks have no actuators.
-        self._driven = self._model.jnt_qposadr[self._model.actuator_trnid[:, 0]]
+        driven = [data.qpos[joint : joint + 1] for joint in self._model.jnt_qposadr[self._model.actuator_trnid[:, 0]]]
         self._target = self._model.site("target0").id
-        self._sites = [data.site_xpos[self._model.site("robot0:grip").id]]
-        self._quaternion: Array | None = None
+        # Numbers that a task does not have are read from here.
+        none = np.zeros(_DRIVEN.stop)
+        grip = data.site_xpos[self._model.site("robot0:grip").id]
+        objects = [none[_OBJECT], none[_QUATERNION]]
+        driven = driven or [none[_DRIVEN]]
         if self.has_object:
-            self._sites.append(data.site_xpos[self._model.site("object0").id])
-            self._quaternion = data.xquat[self._model.body("object0").id]
-        self._warnings = data.warning.number
+            objects = [data.site_xpos[self._model.site("object0").id], data.xquat[self._model.body("object0").id]]
+        self._sources = [grip, *self._fingers, *objects, data.xpos[hand], data.xquat[hand], *driven]
+        self._warnings = data.warning.number[UNSTABLE]
 
     def reset(self, seed: int, read: Array) -> None:
-        """Start an episode and fill ``read`` (12,) with the initial state."""
+        """Start an episode and fill ``read`` (21,) with the initial state."""
         self.goal = self._env.reset(seed=seed)[0]["desired_goal"]
-        self._warnings[:] = WARNED_ALREADY
-        self._read(read)
+        self.data.warning.number[:] = WARNED_ALREADY
+        np.concatenate(self._sources, out=read)
 
-    def simulate(self, displacement: Array, effort: np.float64, read: Array, warnings: NDArray[np.int32]) -> None:
-        """Simulate 20 physics steps after moving the hand's target by ``displacement`` (3,) in metres. Fill ``read``
-        (12,) with the new state and ``warnings`` (3,) with MuJoCo's warning counts."""
+    def simulate(self, inputs: Array, outputs: Array) -> bool:
+        """Write the inputs (mocap position and quaternion, controls), simulate 20 physics steps, and fill the outputs
+        (21,) with the new state. Return whether the simulation is stable."""
         data = self.data
-        np.add(self._hand[0], displacement, out=self._mocap[0])
-        np.add(self._hand[1], _TURN, out=self._mocap[1])
-        if len(self._driven):
-            data.ctrl[:] = data.qpos[self._driven] + (0.0 if self._blocked else effort)
+        self._mocap[0][:], self._mocap[1][:] = inputs[:3], inputs[3:7]
+        data.ctrl[:] = inputs[7 : 7 + len(data.ctrl)]
         mujoco.mj_step(self._model, data, self._substeps)
         if self._blocked:
-            data.qpos[self._fingers] = 0.0
+            for finger in self._fingers:
+                finger[:] = 0.0
             mujoco.mj_forward(self._model, data)
-        self._read(read)
-        warnings[:] = self._warnings[UNSTABLE]
+        np.concatenate(self._sources, out=outputs)
+        return bool((self._warnings == WARNED_ALREADY).all())
 
-    def _read(self, read: Array) -> None:
-        read[:3] = self._sites[0]
-        read[3:5] = self.data.qpos[self._fingers]
-        if self._quaternion is not None:
-            read[5:8], read[8:] = self._sites[1], self._quaternion
+    def describe(self) -> dict[str, Any]:
+        """Return the arguments of :class:`~lw_torchrl.suites.metaworld.compiled_rows.CompiledRows` for this row."""
+        return {
+            "model": self._model,
+            "data": self.data._address,
+            "substeps": self._substeps,
+            "looks": self._blocked,
+            "inputs_at": addresses_of(*self._mocap, self.data.ctrl),
+            "zeros_at": addresses_of(*self._fingers) if self._blocked else [],
+            "outputs_at": addresses_of(*self._sources),
+            "warnings_at": addresses_of(self._warnings),
+        }
 
     def seen(self) -> tuple[RowModel, Any]:
         """Return the model and the data. The target marker, which does not affect physics, is placed at the goal."""
@@ -191,7 +203,8 @@ class FetchEngine(ThreadedEngine):
         self._rows = [_Row(task) for task in tasks]
         self._origin = np.array([_SCENES[task].origin for task in tasks]).reshape(n, 3)
         self._has_object = np.array([row.has_object for row in self._rows], dtype=bool)
-        self._read = np.zeros((n, _READ))
+        self._read = np.zeros((n, _DRIVEN.stop))
+        self._compile()
 
     def _reset_row(self, row: int, seed: int) -> None:
         self._rows[row].reset(seed, self._read[row])
@@ -204,21 +217,18 @@ class FetchEngine(ThreadedEngine):
         self._observation[rows] = np.concatenate((now, now, goal), axis=1)
 
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
-        warnings = np.full((len(action), 3), WARNED_ALREADY, dtype=np.int32)
-        action = fetch_actions(np.clip(action, -1, 1))
-        displacement = (action[:, :3] * _METRES).astype(np.float64)  # multiplied in the action's precision
-        effort = action[:, 3].astype(np.float64)
-
-        def simulate(row: int) -> None:
-            self._rows[row].simulate(displacement[row], effort[row], self._read[row], warnings[row])
-
-        self._pool.work(self._by_group(rows), simulate)
+        action = fetch_actions(np.clip(action[rows], -1, 1))
+        displacement = action[:, :3] * _METRES  # multiplied in the action's precision
+        read = self._read[rows]
+        inputs = (read[:, _HAND] + displacement, read[:, _HAND_QUATERNION] + _TURN, read[:, _DRIVEN] + action[:, 3:])
+        stable = self._simulate(rows, np.concatenate(inputs, axis=1), read)
+        self._read[rows] = read
 
         now = self._now(rows)
-        stable = np.isfinite(now).all(axis=1) & (warnings[rows] == WARNED_ALREADY).all(axis=1)
+        stable &= np.isfinite(now).all(axis=1)
         self._faulted[rows[~stable]] = True
         rows, now = rows[stable], now[stable]
-        achieved = np.where(self._has_object[rows, None], self._read[rows, 5:8], self._read[rows, :3])
+        achieved = np.where(self._has_object[rows, None], self._read[rows, _OBJECT], self._read[rows, _GRIP])
         distance = np.linalg.norm(achieved - self._goal[rows], axis=-1)
         success[rows] = distance < _SUCCESS
         reward[rows] = -distance if self._dense else success[rows]
@@ -229,12 +239,12 @@ class FetchEngine(ThreadedEngine):
         """Return the part of the observations for the current time step: the first 11 values (len(rows), 11)."""
         read, origin = self._read[rows], self._origin[rows]
         now = np.zeros((len(rows), _NOW))
-        now[:, :3] = our_positions(read[:, :3], origin)
+        now[:, :3] = our_positions(read[:, _GRIP], origin)
         now[:, 2] += HAND_HEIGHT
         now[:, 3] = np.clip((read[:, 3] + read[:, 4]) / OPEN, 0.0, 1.0)
         objects = self._has_object[rows]
-        now[objects, 4:7] = our_positions(read[objects, 5:8], origin[objects])
-        now[objects, 7:] = our_quaternions(read[objects, 8:])
+        now[objects, 4:7] = our_positions(read[objects, _OBJECT], origin[objects])
+        now[objects, 7:] = our_quaternions(read[objects, _QUATERNION])
         return now
 
     def poses(self, row: int) -> BodyPoses:

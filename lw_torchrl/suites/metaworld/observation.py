@@ -161,23 +161,23 @@ def quaternion_of_matrix(matrix: Array) -> Array:
     quaternion = np.stack((m21 - m12, m02 - m20, m10 - m01, 1.0 + trace))
     # Most objects are nearly upright, so w is the largest component. Otherwise SciPy first computes the largest
     # component from the diagonal, then the other components from the largest one, which loses fewer digits.
-    tilted = (trace <= m00) | (trace <= m11) | (trace <= m22)
-    if tilted.any():
-        for k in np.flatnonzero(tilted):
-            quaternion[:, k] = _quaternion_of_tilted(matrix[k].reshape(3, 3).tolist(), float(trace[k]))
+    tilted = np.flatnonzero((trace <= m00) | (trace <= m11) | (trace <= m22))
+    if tilted.size:
+        quaternion[:, tilted] = _quaternion_of_tilted(matrix[tilted].reshape(-1, 3, 3), trace[tilted]).T
     x, y, z, w = quaternion * quaternion
     return (quaternion / np.sqrt(x + y + z + w)).T
 
 
-def _quaternion_of_tilted(m: list[list[float]], trace: float) -> list[float]:
-    """Convert a rotation matrix to an unnormalized quaternion (x, y, z, w) if w is not the largest component. Python
-    numbers are fast here because few rows need this function."""
-    i = max(range(3), key=lambda axis: m[axis][axis])
+def _quaternion_of_tilted(matrix: Array, trace: Array) -> Array:
+    """Convert rotation matrices (n, 3, 3) to unnormalized quaternions (n, 4) in x, y, z, w order, if w is not the
+    largest component."""
+    row, i = np.arange(len(matrix)), np.diagonal(matrix, axis1=1, axis2=2).argmax(axis=1)
     j, k = (i + 1) % 3, (i + 2) % 3
-    quaternion = [0.0, 0.0, 0.0, m[k][j] - m[j][k]]
-    quaternion[i] = 1.0 - trace + 2.0 * m[i][i]
-    quaternion[j] = m[j][i] + m[i][j]
-    quaternion[k] = m[k][i] + m[i][k]
+    quaternion = np.empty((len(matrix), 4))
+    quaternion[row, i] = 1.0 - trace + 2.0 * matrix[row, i, i]
+    quaternion[row, j] = matrix[row, j, i] + matrix[row, i, j]
+    quaternion[row, k] = matrix[row, k, i] + matrix[row, i, k]
+    quaternion[:, 3] = matrix[row, k, j] - matrix[row, j, k]
     return quaternion
 
 

@@ -1,10 +1,12 @@
 """Rows (MuJoCo states on shared models), and a base class for engines that simulate groups of rows in threads."""
 
 import os
+import threading
+import weakref
 from abc import abstractmethod
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from math import ceil
 from time import perf_counter
@@ -17,10 +19,11 @@ from numpy.typing import NDArray
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
+from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel
 from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, StateView, sensor_index
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
 from lw_torchrl.suites.metaworld.tables import TaskReward, TaskSources
-from lw_torchrl.suites.metaworld.task_programs import SharedModel
+from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY, SharedModel
 
 _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
@@ -57,11 +60,12 @@ class SimulatedRow:
         self.shared.holder = self
         return observation
 
-    def simulate(self, mocap: Array, control: Array, sensors: Array, warnings: NDArray[np.int32]) -> None:
-        """Simulate five physics steps, then fill ``sensors`` and ``warnings`` (3,) while the state is cached."""
+    def simulate(self, inputs: Array, outputs: Array) -> bool:
+        """Write the inputs (mocap position, controls), simulate five physics steps, and fill the outputs (sensors).
+        Return whether the simulation is stable."""
         self._take_model()
-        self.mocap[...] = mocap
-        self._control[...] = control
+        self.mocap[...] = inputs[:3]
+        self._control[...] = inputs[3:]
         if self._looked:
             self._substep_after_look()
             mujoco.mj_step(self._model, self._data, self._substeps - 1)
@@ -69,8 +73,23 @@ class SimulatedRow:
             mujoco.mj_step(self._model, self._data, self._substeps)
         mujoco.mj_forward(self._model, self._data)  # the next physics step starts its solver from these accelerations
         self._looked = True
-        self._numbers.take(self._sensor_index, out=sensors, mode="clip")
-        warnings[...] = self._warnings
+        self._numbers.take(self._sensor_index, out=outputs, mode="clip")
+        return bool((self._warnings == WARNED_ALREADY).all())
+
+    def describe(self) -> dict[str, Any]:
+        """Return the arguments of :class:`~lw_torchrl.suites.metaworld.compiled_rows.CompiledRows` for this row."""
+        return {
+            "model": self._model,
+            "places": self._places,
+            "data": self._data._address,
+            "substeps": self._substeps,
+            "looks": True,
+            "looks_ahead": True,
+            "inputs_at": addresses_of(self.mocap, self._control),
+            "zeros_at": [],
+            "outputs_at": self._numbers.ctypes.data + self._numbers.itemsize * self._sensor_index,
+            "warnings_at": addresses_of(self._warnings),
+        }
 
     def seen(self) -> tuple[RowModel, Any]:
         """Load this row's positions of bodies and sites into the shared model, then return the model and the data."""
@@ -116,46 +135,105 @@ def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
 
 
 class WorkerPool:
-    """A pool of threads that process groups of rows, slowest groups first. Only one thread at a time processes a group,
-    so the group's rows may share a model. The results do not depend on the thread."""
+    """A pool of threads. The calling thread works too, so a pool of one thread has no other."""
 
     def __init__(self, num_threads: int) -> None:
         self._helpers = num_threads - 1
-        self._threads = ThreadPoolExecutor(self._helpers, "lw_torchrl") if self._helpers else None
+        self._start()
+
+    def _start(self) -> None:
+        self._process, self._idle = os.getpid(), True
+        self._call: list[Callable[[], object] | None] = [_do_nothing]
+        self._wake, self._busy = ([threading.Lock() for _ in range(self._helpers)] for _ in range(2))
+        for wake, busy in zip(self._wake, self._busy, strict=True):
+            wake.acquire()
+            # A daemon, because it waits inside acquire() when Python exits. It keeps no reference to the pool.
+            threading.Thread(target=_help, args=(wake, busy, self._call), name="lw_torchrl", daemon=True).start()
+        self._stop = weakref.finalize(self, _stop, self._call, self._wake)
+        self._stop.atexit = False
+
+    def run(self, call: Callable[[], object], helpers: int) -> None:
+        """Call ``call()`` in this thread and in at most ``helpers`` others at once. All work must be done when the call
+        of this thread returns; the other calls may return later."""
+        if self._process != os.getpid():  # a fork has the pool's locks, but not its threads
+            self._stop.detach()
+            self._start()
+        if not self._idle:  # an error or Ctrl-C left a call
+            self._finish()
+        self._idle = False
+        self._call[0] = call
+        for wake in self._wake[:helpers]:
+            if wake.locked():  # otherwise this thread has not yet noticed that it was woken up before
+                wake.release()
+        try:
+            call()
+        except BaseException:
+            self._finish()
+            raise
+        self._call[0] = _do_nothing
+        self._idle = True
+
+    def _finish(self) -> None:
+        """Let no other thread start the call, and wait for those that have started."""
+        self._call[0] = _do_nothing
+        for busy in self._busy:
+            with busy:
+                pass
+        self._idle = True
 
     def work(self, groups: Iterable[tuple[RowGroup, Sequence[int]]], do: Callable[[int], None]) -> None:
-        """Call ``do(item)`` for every item of every ``(group, items)`` pair; the items of one group run in order."""
-        if self._threads is None:
-            for _, items in groups:
-                for item in items:
-                    do(item)
-            return
+        """Call ``do(item)`` for every item of every ``(group, items)`` pair, slowest groups first. Only one thread at a
+        time processes a group, in order, so the group's rows may share a model."""
         waiting = deque(sorted(groups, key=lambda job: job[0].seconds * len(job[1]), reverse=True))
+        errors: list[BaseException] = []
+        caller = threading.get_ident()
 
         def work_through() -> None:
-            while True:
-                try:
-                    group, items = waiting.popleft()
-                except IndexError:
-                    return
-                start = perf_counter()
-                for item in items:
-                    do(item)
-                group.seconds = (perf_counter() - start) / len(items)
+            try:
+                while True:
+                    try:
+                        group, items = waiting.popleft()
+                    except IndexError:
+                        return
+                    start = perf_counter()
+                    for item in items:
+                        do(item)
+                    group.seconds = (perf_counter() - start) / len(items)
+            except BaseException as error:
+                waiting.clear()
+                errors.append(error)
+            finally:
+                if threading.get_ident() == caller:
+                    self._finish()
 
-        helpers = min(self._helpers, len(waiting) - 1)
-        futures = [self._threads.submit(work_through) for _ in range(helpers)]
-        try:
-            work_through()
-        finally:
-            waiting.clear()
-            errors = [error for future in futures if (error := future.exception()) is not None]
-        for error in errors:
-            raise error
+        self.run(work_through, len(waiting) - 1)
+        if errors:
+            raise errors[0]
 
     def close(self) -> None:
-        if self._threads is not None:
-            self._threads.shutdown()
+        self._finish()
+        self._stop()
+
+
+def _do_nothing() -> None:
+    pass
+
+
+def _help(wake: threading.Lock, busy: threading.Lock, call: list[Callable[[], object] | None]) -> None:
+    while True:
+        wake.acquire()
+        with busy:
+            if (now := call[0]) is None:
+                return
+            now()
+            del now  # it refers to the rows of a step
+
+
+def _stop(call: list[Callable[[], object] | None], wakes: Sequence[threading.Lock]) -> None:
+    call[0] = None
+    for wake in wakes:
+        if wake.locked():
+            wake.release()
 
 
 def available_cores() -> int:
@@ -175,6 +253,30 @@ class ThreadedEngine(SeenRows):
         self._goal = np.zeros((len(keys), 3))
         self._observation = np.zeros((len(keys), layout.size))
         self._started, self._faulted = np.zeros((2, len(keys)), dtype=bool)
+        self._compiled: CompiledRows | None = None
+
+    def _compile(self) -> None:
+        """Simulate the rows with the Numba kernel, if there is one."""
+        if (kernel := find_row_kernel()) is not None:
+            self._compiled = CompiledRows(kernel, self._rows, [group.rows for group in self._groups])
+
+    def _simulate(self, rows: Index, inputs: Array, outputs: Array) -> Mask:
+        """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
+
+        The Python threads are slower than the kernel, which has the same bits: they run ten Python calls a row.
+        """
+        if self._compiled is not None:
+            return self._compiled.simulate(rows, inputs, outputs, self._pool.run)
+        stable = np.zeros(len(rows), dtype=bool)
+        place = {row: k for k, row in enumerate(rows.tolist())}
+
+        def simulate(row: int) -> None:
+            k = place[row]
+            with suppress(mujoco.FatalError):
+                stable[k] = self._rows[row].simulate(inputs[k], outputs[k])
+
+        self._pool.work(self._by_group(rows), simulate)
+        return stable
 
     @abstractmethod
     def _reset_row(self, row: int, seed: int) -> None:
@@ -195,6 +297,8 @@ class ThreadedEngine(SeenRows):
         # If a reset fails half-way, the rows must not be stepped.
         self._started[index] = False
         self._pool.work(self._by_group(index), lambda row: self._reset_row(row, seed_of[row]))
+        if self._compiled is not None:
+            self._compiled.forget(index)
         self._observe_first(index)
         self._faulted[index] = False
         self._started[index] = True
@@ -206,7 +310,10 @@ class ThreadedEngine(SeenRows):
         self._faulted |= active & ~np.isfinite(action).all(axis=1)
         reward, success = np.zeros(len(active)), np.zeros(len(active), dtype=bool)
         if (rows := np.flatnonzero(active & ~self._faulted)).size:
+            # If a step is interrupted, the rows must be reset.
+            self._started[rows] = False
             self._step_running(rows, action, reward, success)
+            self._started[rows] = True
         return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
 
     def _by_group(self, rows: Index) -> list[tuple[RowGroup, list[int]]]:
@@ -226,4 +333,5 @@ class ThreadedEngine(SeenRows):
         """Stop the threads."""
         super().close()
         self._pool.close()
+        self._compiled = None
         self._rows = []

@@ -23,12 +23,13 @@ FINGERS = np.array([1.0, -1.0])  # one action value moves both fingers, in oppos
 class VectorizedEngine(simulated_rows.ThreadedEngine):
     """An engine that simulates physics in threads and computes everything else in NumPy for all rows at once.
 
-    For any number of threads, the results are bit-identical to those of
+    With Numba (``lw_torchrl[fast]``, on Linux), one compiled call simulates all rows; otherwise a warning says why not.
+    With or without it and for any number of threads, the results are bit-identical to those of
     :class:`~lw_torchrl.suites.metaworld.plain_engine.MetaWorldEngine`. Rows with the same XML file share a compiled
     model.
 
-    A row faults if the action is not finite or the simulation becomes unstable. The row then repeats the last stable
-    observation and is not simulated until it is reset; other rows are not affected.
+    A row faults if the action is not finite, the simulation becomes unstable or MuJoCo raises an error. The row then
+    repeats the last stable observation and is not simulated until it is reset; other rows are not affected.
 
     Args:
         tasks: the task of each row.
@@ -86,6 +87,7 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         self._mocap = np.zeros((n, 3))
         self._current = np.zeros((n, 18))
         self._running: _RunningRows | None = None
+        self._compile()
 
     def _reset_row(self, row: int, seed: int) -> None:
         self._observation[row] = self._rows[row].reset(seed)
@@ -110,14 +112,9 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         shift = np.minimum(np.maximum(action[:, :3], -1), 1) * self._action_scale
         mocap = np.minimum(np.maximum(self._mocap[rows] + shift, running.mocap_low), running.mocap_high)
         self._mocap[rows] = mocap
+        inputs = np.concatenate((mocap, action[:, 3:] * FINGERS), axis=1)
         sensors = np.empty((len(rows), self._width))
-        warnings = np.empty((len(rows), 3), dtype=np.int32)
-        control = action[:, 3:] * FINGERS
-
-        def simulate(k: int) -> None:
-            running.members[k].simulate(mocap[k], control[k], sensors[k], warnings[k])
-
-        self._pool.work(running.groups, simulate)
+        stable = self._simulate(rows, inputs, sensors)
 
         current = running.observer.current(sensors)
         goal = self._goal[rows]
@@ -125,8 +122,7 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         np.clip(observation, running.low, running.high, out=observation)
         achieved = running.success(sensors, current, goal)
         rewards = achieved if running.reward is None else running.reward(sensors, observation, goal, action)
-        warned = (warnings != task_programs.WARNED_ALREADY).any(axis=1)
-        stable = np.isfinite(observation).all(axis=1) & ~warned
+        stable &= np.isfinite(observation).all(axis=1)
         if not stable.all():
             self._faulted[rows[~stable]] = True
             rows, current, observation = rows[stable], current[stable], observation[stable]
@@ -142,12 +138,10 @@ class _RunningRows:
 
     def __init__(self, engine: VectorizedEngine, rows: Index) -> None:
         self.rows = rows
-        self.members = members = [engine._rows[row] for row in rows]
+        members = [engine._rows[row] for row in rows]
         sources = [member.sources for member in members]
         self.observer = Observer(sources)
         self.success = SuccessFunction(sources, lambda k: members[k].program)
         self.reward = None if engine._starts is None else DenseReward(engine._starts, rows)
-        place = {row: k for k, row in enumerate(rows.tolist())}
-        self.groups = [(group, [place[row] for row in items]) for group, items in engine._by_group(rows)]
         self.low, self.high = engine._low[rows], engine._high[rows]
         self.mocap_low, self.mocap_high = engine._mocap_low[rows], engine._mocap_high[rows]
