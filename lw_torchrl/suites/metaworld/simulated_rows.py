@@ -259,7 +259,7 @@ class ThreadedEngine(SeenRows):
     def _simulate(self, rows: Index, inputs: Array, outputs: Array) -> Mask:
         """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
 
-        The Python threads are slower than the kernel, which has the same bits: they run ten Python calls a row.
+        Without the kernel, Python threads give the same bits, more slowly: they make ten Python calls a row.
         """
         if self._compiled is not None:
             return self._compiled.simulate(rows, inputs, outputs, self._pool.run)
