@@ -328,18 +328,18 @@ def test_pool_waits_for_a_thread_that_is_still_busy(fails):
 
 def test_no_two_threads_take_the_same_row():
     @njit(nogil=True)
-    def take(counts: np.ndarray, times: int) -> None:
-        for _ in range(times):
-            row_kernel.add_atomically(counts.ctypes.data, 1)
+    def take(counts: np.ndarray, taken: np.ndarray) -> None:
+        for k in range(len(taken)):
+            taken[k] = row_kernel.add_atomically(counts.ctypes.data, 1)
 
-    counts = np.zeros(1, np.int64)
-    take(counts, 0)
-    threads = [threading.Thread(target=take, args=(counts, 1_000_000)) for _ in range(4)]
+    counts, taken = np.zeros(1, np.int64), np.zeros((3, 1_000_000), np.int64)
+    take(counts, taken[0, :0])
+    threads = [threading.Thread(target=take, args=(counts, numbers)) for numbers in taken]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert counts[0] == 4_000_000
+    assert np.array_equal(np.sort(taken.ravel()), np.arange(taken.size))
 
 
 @pytest.mark.parametrize("last", range(3))
@@ -353,6 +353,13 @@ def test_call_returns_when_all_rows_are_done(last):
         steps = [now * 100_000 if row == last else now for row in range(3)]
         assert [round(row.data.time / row.model.opt.timestep) for row in rows] == steps
     pool.close()
+
+
+def test_engine_has_no_more_threads_than_rows():
+    before = set(threading.enumerate())
+    engine = VectorizedEngine(["reach", "push"], num_threads=16)
+    assert len(set(threading.enumerate()) - before) == 1
+    engine.close()
 
 
 def test_closed_and_collected_pools_end_their_threads():
