@@ -12,10 +12,11 @@ from torch.func import vmap
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
+from lw_torchrl.language.gates import product
 from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.modules import transform_of, with_plans
-from lw_torchrl.modules.query_evaluator import conjunction
+
 
 PLANS = lw.load_plans("MT10")
 OTHER = lw.Plans([PLANS["push"]])
@@ -179,18 +180,17 @@ def test_not_changes_the_sign_of_a_logit():
 
 
 def test_probability_of_a_conjunction_is_the_product():
-    logits = torch.tensor([[0.3, -1.2, 2.0], [29.0, 30.0, -30.0], [4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    mask = torch.tensor([[True, True, True], [True, True, False], [True, False, False], [False, False, False]])
-    output = conjunction(logits, mask)
-    p = torch.where(mask, logits.double().sigmoid(), 1.0).prod(-1)
+    logits = torch.tensor([[0.3, -1.2, 2.0], [29.0, 30.0, 1e4], [4.0, 1e4, 1e4], [1e4, 1e4, 1e4]])
+    output = product(logits)
+    p = logits.double().sigmoid().prod(-1)
     assert torch.allclose(output[:3].double(), p[:3].logit(), atol=1e-4)
     assert output[3] > 29
-    assert torch.allclose(conjunction(logits[:, :1], mask[:, :1])[:3], logits[:3, 0], atol=1e-5)
+    assert torch.allclose(product(logits[:, :1])[:3], logits[:3, 0], atol=1e-5)
 
 
 def test_conjunction_has_a_finite_gradient_everywhere():
-    logits = torch.tensor([[30.0, 30.0], [-30.0, -30.0], [0.0, 1.0]], requires_grad=True)
-    conjunction(logits, torch.tensor([[True, True], [True, True], [False, False]])).sum().backward()
+    logits = torch.tensor([[30.0, 30.0], [-30.0, -30.0], [1e4, 1e4]], requires_grad=True)
+    product(logits).sum().backward()
     assert logits.grad.isfinite().all()
     assert (logits.grad[2] == 0).all()
 
