@@ -64,8 +64,8 @@ def compile_gates(
     Args:
         tasks: the expressions of each task. Shorter lists are padded with expressions that are never true.
         leaves: for each task, a function from a leaf or its negation to (indices of its values, negated).
-        size: the number of values of a task.
-        true: the index of a value that is always true.
+        size: the number of values of a task, including the value that is always true.
+        true: the index of this value.
     """
     levels = [inner_gates(expressions) for expressions in tasks]
     numbered: list[list[list[Expression]]] = []  # the gates of each task at each level

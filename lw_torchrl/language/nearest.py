@@ -113,7 +113,7 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
     except QueryError:  # a stray parenthesis
         match = _nearest_match([word for word in words if word not in "()"], owner, by)
     # "at or near the puck" does not consist of two conditions.
-    return conjunction if match is None or match.least_score < min(conjunction.least_score, 1.0 - LIMIT) else match
+    return conjunction if match is None or match.least_score < conjunction.least_score else match
 
 
 def _nearest_match(words: list[str], task: Task, by: str) -> QueryMatch | None:

@@ -19,6 +19,7 @@ from lw_torchrl.language.expressions import (
     all_of,
     count_mentions,
     implied,
+    leaves,
     literals,
     negate,
     replace_leaves,
@@ -63,9 +64,8 @@ class Query:
     Example:
         >>> str(parse_query("Is the gripper open and not above the puck?", task="pick-place"))
         "the robot's gripper is open and the robot's gripper is not above the puck"
-        >>> query = parse_query("the gripper is neither open nor (near the puck unless above the puck)", task="push")
-        >>> print(query)
-        the robot's gripper is not open and (the robot's gripper is not near the puck or the robot's gripper is above the puck)
+        >>> print(parse_query("either the gripper is open or the puck is not near the target location", task="push"))
+        the robot's gripper is open or the puck is not near the target location
     """
 
     expression: Expression
@@ -75,7 +75,9 @@ class Query:
         if not isinstance(expression, Expression):
             object.__setattr__(self, "_given", tuple(expression))
             expression = all_of(expression)
-        object.__setattr__(self, "expression", replace_leaves(expression, _without_negation))
+        if any(clause.negated for clause in leaves(expression)):
+            expression = replace_leaves(expression, _without_negation)
+        object.__setattr__(self, "expression", expression)
 
     def __str__(self) -> str:
         if self._given:
@@ -86,7 +88,7 @@ class Query:
     def is_conjunction(self) -> bool:
         """True for a clause or a conjunction of clauses: a query without "or"."""
         parts = self.expression.parts
-        return bool(self._given) or self.expression.kind != "any" and all(part.kind == "leaf" for part in parts)
+        return bool(self._given) or (self.expression.kind != "any" and all(part.kind == "leaf" for part in parts))
 
     @cached_property
     def clauses(self) -> tuple[Clause, ...]:

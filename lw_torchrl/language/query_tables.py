@@ -101,7 +101,7 @@ class QueryTables(NamedTuple):
 
 
 def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> tuple[QueryTables, Shapes]:
-    """Compile the queries of tasks to tables with one row per task, in the order of the mapping, and the gates' shapes."""
+    """Compile the queries of tasks to tables, one row per task in the order of the mapping, and the shapes of gates."""
     expressions = [[query.expression for query in listed] for listed in queries.values()]
     atoms_of = [
         {clause: clause_atoms(clause, task) for query in listed for clause in leaves(query.expression)}

@@ -184,9 +184,9 @@ class ClauseEvaluator(QueryEvaluator):
 
     Reads a view of a state, such as an observation or pictures, and ``task_id``; writes the keys of
     :class:`QueryEvaluator`, with logits of -1e4 beyond a plan's last step. The network answers single clauses, which
-    the plans' conditions combine as independent statements: the probability of "A and B" is the product of theirs, that
-    of "A or B" is 1 - P(not A) P(not B). Gradients reach every clause. A subclass sets ``network``, which maps views of B states and their clauses (B, C) to
-    logits (B, C), and ``seen_dims``, the number of dimensions of a view.
+    the plans' conditions combine as independent statements: P(A and B) = P(A) P(B), and
+    P(A or B) = 1 - P(not A) P(not B). Gradients reach every clause. A subclass sets ``network``, which maps views of B
+    states and their clauses (B, C) to logits (B, C), and ``seen_dims``, the number of dimensions of a view.
 
     Args:
         plans, answers: see :class:`QueryEvaluator`.
@@ -285,7 +285,7 @@ class ClauseEvaluator(QueryEvaluator):
             return operand
 
         conditions = [[step.condition.expression for step in plan.steps] for plan in plans]
-        gates = compile_gates(conditions, list(map(operands, by_plan)), most, true=most)
+        gates = compile_gates(conditions, list(map(operands, by_plan)), most + 1, true=most)
         self.shapes = gates.shapes
         pairs = [(plan.definition, c) for plan, clauses in zip(plans, by_plan, strict=True) for c in clauses]
         return self.code(pairs).pick(number)._replace(inputs=gates.inputs, flipped=gates.negated)

@@ -17,7 +17,6 @@ from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.modules import transform_of, with_plans
 
-
 PLANS = lw.load_plans("MT10")
 OTHER = lw.Plans([PLANS["push"]])
 S = PLANS.num_steps
@@ -177,6 +176,29 @@ def test_not_changes_the_sign_of_a_logit():
     logits = make(plans)(states(6, plans))["qaf_logits"]
     assert torch.allclose(logits[:, 0], -logits[:, 1], atol=1e-5)
     assert (logits[:, 0] != 0).all()
+
+
+def test_or_and_else_combine_the_answers_to_clauses():
+    texts = ["gripper open", "gripper near puck", "gripper open or near puck", "not (gripper open or near puck)"]
+    texts += ["gripper open and (near puck or above puck)", "gripper above puck", "always", "gripper not near puck"]
+    plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", [(text, "grasp the puck") for text in texts])])
+    evaluator = make(plans)
+    logits = evaluator(states(20, plans))["qaf_logits"]
+    opened, near, either, neither, nested, above, always, not_near = logits.double().sigmoid().unbind(1)
+    torch.testing.assert_close(either, 1 - (1 - opened) * (1 - near), atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(neither, (1 - opened) * (1 - near), atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(nested, opened * (1 - (1 - near) * (1 - above)), atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(not_near, 1 - near, atol=1e-6, rtol=1e-5)
+    assert (always > 0.999999).all()
+    slopes = torch.autograd.grad(logits[:, 3].sum(), evaluator.parameters(), retain_graph=True)
+    assert all(slope.isfinite().all() for slope in slopes)
+    assert any(slope.any() for slope in slopes)
+
+
+def test_plans_without_any_clause_are_refused():
+    plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", [("always", "grasp the puck")])])
+    with pytest.raises(ValueError, match="condition with a clause"):
+        make(plans)
 
 
 def test_probability_of_a_conjunction_is_the_product():
