@@ -67,46 +67,47 @@ def compile_gates(
         size: the number of values of a task, including the value that is always true.
         true: the index of this value.
     """
-    levels = [inner_gates(expressions) for expressions in tasks]
-    numbered: list[list[list[Expression]]] = []  # the gates of each task at each level
-    for inner in levels:
-        numbered.append([[gate for gate in inner if inner[gate] == level] for level in range(_depth(levels))])
-    steps = max(map(len, tasks))
-    sizes = [max(len(own[level]) for own in numbered) for level in range(_depth(levels))]
-    starts = [size + sum(sizes[:level]) for level in range(len(sizes))]
-    never: list[Operand] = [((true,), True)]
-    tables: list[list[list[list[Operand]]]] = [[] for _ in (*sizes, steps)]  # level, task, gate, operand
-    for own, expressions, leaf in zip(numbered, tasks, leaves, strict=True):
-        place = {
-            gate: start + number for start, gates in zip(starts, own, strict=True) for number, gate in enumerate(gates)
-        }
+    inner = [inner_gates(expressions) for expressions in tasks]
+    places: list[dict[Expression, int]] = [{} for _ in tasks]  # the place of each gate among the values
 
-        def operands(parts: Iterable[Expression], place: dict = place, leaf: Callable = leaf) -> list[Operand]:
-            return [leaf(part) if part.kind == "leaf" else ((place[negate(part)],), True) for part in parts]
+    def operands(task: int, parts: Iterable[Expression]) -> list[Operand]:
+        return [leaves[task](part) if part.kind == "leaf" else ([places[task][negate(part)]], True) for part in parts]
 
-        for level, (gates, width) in enumerate(zip(own, sizes, strict=True)):
-            rows = [operands(gate.parts) for gate in gates]
-            tables[level].append(rows + [never] * (width - len(rows)))
-        rows = [
-            never if each == FALSE else operands(each.parts if each.kind == "all" else [each]) for each in expressions
-        ]
-        tables[-1].append(rows + [never] * (steps - len(rows)))
-    inputs, negated, shapes = [], [], []
-    for table in tables:
-        width = max(1, *(len(row) for own in table for row in own))
-        depth = max(1, *(len(values) for own in table for row in own for values, _ in row))
-        padding: Operand = ((true,) * depth, False)
-        padded = [[[*row, *[padding] * (width - len(row))] for row in own] for own in table]
-        values = [[[[*each, *[true] * (depth - len(each))] for each, _ in row] for row in own] for own in padded]
-        inputs.append(torch.tensor(values).permute(0, 3, 2, 1).flatten(1))  # (T, G, K, J)
-        flips = torch.tensor([[[flipped for _, flipped in row] for row in own] for own in padded])
-        negated.append(flips.transpose(1, 2).flatten(1))
-        shapes.append((depth, width, len(table[0])))
-    return Gates(torch.cat(inputs, 1), torch.cat(negated, 1), tuple(shapes))
+    tables = []
+    for level in range(1 + max((max(own.values(), default=-1) for own in inner), default=-1)):
+        gates = [[gate for gate in own if own[gate] == level] for own in inner]
+        rows = [[operands(task, gate.parts) for gate in own] for task, own in enumerate(gates)]
+        tables.append(_tables(rows, true))
+        for place, own in zip(places, gates, strict=True):
+            place.update((gate, size + number) for number, gate in enumerate(own))
+        size += max(map(len, gates))
+    rows = [
+        [[([true], True)] if each == FALSE else operands(task, each.parts if each.kind == "all" else [each])
+         for each in expressions]
+        for task, expressions in enumerate(tasks)
+    ]  # fmt: skip
+    tables.append(_tables(rows, true))
+    inputs, negated, shapes = zip(*tables, strict=True)
+    return Gates(torch.cat(inputs, 1), torch.cat(negated, 1), shapes)
 
 
-def _depth(levels: Sequence[dict[Expression, int]]) -> int:
-    return 1 + max((level for inner in levels for level in inner.values()), default=-1)
+def _tables(rows: list[list[list[Operand]]], true: int) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
+    """Return the inputs, the negated operands and the shape (J, K, G) of a level, given each task's gates' operands."""
+    count = max(map(len, rows))
+    width = max(1, *(len(gate) for own in rows for gate in own))
+    depth = max(1, *(len(values) for own in rows for gate in own for values, _ in gate))
+    never: list[Operand] = [([true], True)]
+    full = [
+        [[*gate, *[([true], False)] * (width - len(gate))] for gate in own + [never] * (count - len(own))]
+        for own in rows
+    ]
+    inputs = [[[[*values, *[true] * (depth - len(values))] for values, _ in gate] for gate in own] for own in full]
+    negated = torch.tensor([[[flipped for _, flipped in gate] for gate in own] for own in full])
+    return (
+        torch.tensor(inputs).permute(0, 3, 2, 1).flatten(1),
+        negated.transpose(1, 2).flatten(1),
+        (depth, width, count),
+    )
 
 
 def evaluate_gates(values: Tensor, gates: Gates, truth: Truth) -> Tensor:

@@ -20,7 +20,6 @@ from lw_torchrl.language.queries import (
     Query,
     QueryError,
     base_clauses,
-    check_length,
     read_query,
     split_words,
 )
@@ -102,7 +101,6 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
         part = _nearest_part(" ".join(text.split()), owner, by)
         return QueryMatch(part.query, part.score, (part,))
     words = split_words(" and ".join(pieces))
-    check_length(text, words)
     # Spaces hide other words such as "or" from the parser.
     conjunction = _nearest_match([word for piece in pieces for word in ("and", f" {piece}")][1:], owner, by)
     assert conjunction is not None  # each piece is an operand

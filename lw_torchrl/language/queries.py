@@ -114,15 +114,29 @@ class QueryError(ValueError):
     """The error for a text that is not a query about the objects of its task."""
 
 
-def check_length(text: str, words: Sequence[str]) -> None:
-    """Raise a QueryError if a text has more clauses than a query may have."""
-    if (clauses := 1 + sum(word.casefold() in ("and", "or", "nor", "unless") for word in words)) > _MOST_CLAUSES:
-        raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {clauses}")
-
-
 def split_words(text: str) -> list[str]:
-    """Split a text into words and parentheses."""
-    return re.findall(r"[()]|[^\s()]+", text)
+    """Split a text into words and parentheses. "not above or near the puck" becomes "not (above the puck or near the
+    puck)".
+
+    Raises:
+        QueryError: the text has more clauses than a query may have.
+    """
+    words = re.findall(r"[()]|[^\s()]+", text)
+    clauses = 1 + sum(word.casefold() in ("and", "or", "nor", "unless") for word in words)
+    if clauses > _MOST_CLAUSES:
+        raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {clauses}")
+    spaced, pattern = " ".join(words), _two_relations(tuple(RELATIONS))
+    if pattern.search(spaced) is None:
+        return words
+    return re.findall(r"[()]|[^\s()]+", pattern.sub(r"(\1 \4 \2 \3 \4)", spaced))
+
+
+@lru_cache(maxsize=16)
+def _two_relations(names: tuple[str, ...]) -> re.Pattern[str]:
+    """Compile a pattern that matches two relations to one object."""
+    relation = "|".join(map(re.escape, sorted(names, key=len, reverse=True)))
+    word = r"(?!(?:and|or|nor|unless|is|isn't)\b)[^\s()]+"
+    return re.compile(rf"\b({relation}) (and|or) ({relation}) ({word}(?: {word})*)", re.IGNORECASE)
 
 
 @lru_cache(maxsize=256)
@@ -282,7 +296,6 @@ def read_query(text: str, task: Task) -> Query | None:
 
 def _parse(text: str, task: Task, explain: bool) -> Query:
     words = split_words(text.replace("’", "'").casefold().strip().strip(" ?.!"))
-    check_length(text, words)
     clauses: list[Clause] = []
 
     def clause(operand: list[str]) -> Expression:

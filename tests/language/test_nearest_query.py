@@ -176,6 +176,11 @@ def test_connectives(text, nearest_text):
     assert nearest_query(text, "push").query == parse_query(nearest_text, "push")
 
 
+def test_two_relations_to_one_object():
+    match = nearest_query("the gripper is above or around teh puck", "push")
+    assert match.query == parse_query("gripper above puck or around puck", "push")
+
+
 def test_a_list_of_prepositions_is_one_condition():
     match = nearest_query("the gripper is at or near the puck", "push")
     assert str(match.query) == "the robot's gripper is near the puck"
