@@ -249,4 +249,5 @@ def test_a_condition_with_or_is_a_sentence():
     assert [lw.parse_query(clause.condition, "push") for clause in clauses] == [step.condition for step in plan.steps]
     both = '{"steps": [{"condition": ["gripper open or closed", "gripper near puck"], "skill": "grasp the puck"}]}'
     (clause,) = read_structured(both).sections[0].clauses
-    assert lw.parse_query(clause.condition, "push") == lw.parse_query("gripper near puck", "push")
+    expected = lw.parse_query("(gripper open or closed) and gripper near puck", "push")
+    assert lw.parse_query(clause.condition, "push") == expected
