@@ -11,7 +11,7 @@ CONNECTIVES = ("and", "or", "nor", "unless", "either", "neither", "both")
 """The words that join conditions, which no name of an object or a relation may contain."""
 
 
-@dataclass
+@dataclass(slots=True)
 class _Group:
     """The operands that a parser has read since a parenthesis, "either", "both" or "neither"."""
 
