@@ -130,7 +130,10 @@ def _same(name: str, task: Task) -> bool:
 
 
 def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Reading, Section]:
-    """Return the result of the first reader that finds clauses for the task, and its section with the most clauses."""
+    """Try the readers in order; return the first result that has clauses for the task.
+
+    Also return that result's section with the most clauses.
+    """
     empty: list[tuple[Reading, Section]] = []
     for reader in dict.fromkeys((read, PythonReading, ProseReading)):
         reading = reader(text)

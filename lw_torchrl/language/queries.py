@@ -248,7 +248,7 @@ class _ClauseParser:
         if predicate in STATES and subject not in self.task.openings:
             self.at -= len(predicate.split())
             openable = " and ".join(f"the {name}" for name in self.task.openings).replace(GRIPPER, "gripper")
-            raise self.error(f"a predicate of the {subject}; only {openable} can be {' or '.join(STATES)}")
+            raise self.error(f"a predicate that fits the {subject} (only {openable} can be {' or '.join(STATES)})")
         start, other = self.at, None if predicate in UNARY else self.name()
         if other is None and predicate not in UNARY:
             raise self.name_error()

@@ -271,7 +271,7 @@ class _StepParser:
         return [(c.subject, c.object) for c in clauses if c.object is not None and GRIPPER not in (c.subject, c.object)]
 
     def _compared_point(self, moved: str, target: str) -> str:
-        """Return the point on the moved object (a wrench's ring) that the condition compares with the target."""
+        """Return the point on the moved object (e.g. a wrench's ring) that the condition compares to the target."""
         for pair in self._pairs():
             for point, other in (pair, pair[::-1]):
                 if same_object(self.task, other, target) and same_object(self.task, point, moved):
