@@ -17,6 +17,7 @@ from lw_torchrl.language.expressions import (
     TRUE,
     Expression,
     all_of,
+    as_expression,
     count_mentions,
     implied,
     leaves,
@@ -74,8 +75,8 @@ class Query:
     def __init__(self, expression: Expression | tuple[Clause, ...]) -> None:
         if not isinstance(expression, Expression):
             object.__setattr__(self, "_given", tuple(expression))
-            expression = all_of(expression)
-        if any(clause.negated for clause in leaves(expression)):
+            expression = all_of(map(_without_negation, expression))
+        elif any(clause.negated for clause in leaves(expression)):
             expression = replace_leaves(expression, _without_negation)
         object.__setattr__(self, "expression", expression)
 
@@ -87,8 +88,9 @@ class Query:
     @property
     def is_conjunction(self) -> bool:
         """True for a clause or a conjunction of clauses: a query without "or"."""
-        parts = self.expression.parts
-        return bool(self._given) or (self.expression.kind != "any" and all(part.kind == "leaf" for part in parts))
+        if self._given:
+            return True
+        return self.expression.kind != "any" and all(part.kind == "leaf" for part in self.expression.parts)
 
     @cached_property
     def clauses(self) -> tuple[Clause, ...]:
@@ -98,12 +100,11 @@ class Query:
     @cached_property
     def implied(self) -> tuple[Clause, ...]:
         """The clauses that are true wherever the query is true, as far as its form shows."""
-        return tuple(map(_as_clause, implied(self.expression)))
+        return self._given or tuple(map(_as_clause, implied(self.expression)))
 
 
 def _without_negation(clause: Clause) -> Expression:
-    positive = all_of([replace(clause, negated=False)])
-    return negate(positive) if clause.negated else positive
+    return negate(replace(clause, negated=False)) if clause.negated else as_expression(clause)
 
 
 def _as_clause(literal: Expression) -> Clause:
@@ -320,7 +321,8 @@ def check_query(query: str | Query, task: str | Task) -> Query:
     if not isinstance(query, Query):
         return parse_query(query, task)
     owner = get_task(task)
-    if (clauses := max(len(query.clauses), count_mentions(query.expression))) > _MOST_CLAUSES:
+    clauses = len(query.clauses) if query.is_conjunction else count_mentions(query.expression)
+    if clauses > _MOST_CLAUSES:
         raise QueryError(f"a query must have at most {_MOST_CLAUSES} clauses when it is written, got {clauses}")
     if all(_is_of(clause, owner) for clause in query.clauses):
         return query

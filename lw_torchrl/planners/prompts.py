@@ -150,7 +150,7 @@ def write_structured(plan: ConditionalPlan, style: Style) -> str:
 
 def _write_query(query: Query) -> list[dict[str, str]] | str:
     """Convert a query to JSON: one object per clause of a conjunction, or a sentence for any other query."""
-    if not query.is_conjunction:
+    if not query.is_conjunction or not query.clauses:
         return str(query)
     rows = []
     for clause in query.clauses:
