@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -11,7 +12,7 @@ from itertools import permutations
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._util.checks import typed
-from lw_torchrl.language.connectives import CONNECTIVES, parse_words
+from lw_torchrl.language.connectives import CONNECTIVES, OPENERS, parse_words
 from lw_torchrl.language.expressions import (
     FALSE,
     TRUE,
@@ -120,12 +121,15 @@ def split_words(text: str) -> list[str]:
     puck)".
 
     Raises:
-        QueryError: the text has more clauses than a query may have.
+        QueryError: the text has more clauses or groups than a query may have.
     """
     words = re.findall(r"[()]|[^\s()]+", text)
-    clauses = 1 + sum(word.casefold() in ("and", "or", "nor", "unless") for word in words)
-    if clauses > _MOST_CLAUSES:
-        raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {clauses}")
+    joins = Counter(map(str.casefold, words))
+    clauses = 1 + sum(joins[word] for word in ("and", "or", "nor", "unless"))
+    groups = sum(joins[word] for word in OPENERS)
+    for number, counted in ((clauses, "clauses"), (groups, "parentheses")):
+        if number > _MOST_CLAUSES:
+            raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} {counted}, got {number}")
     spaced, pattern = " ".join(words), _two_relations(tuple(RELATIONS))
     if pattern.search(spaced) is None:
         return words
