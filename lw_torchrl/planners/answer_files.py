@@ -63,6 +63,11 @@ class Reply:
     tokens: Tokens = field(default_factory=Tokens)
     notes: tuple[str, ...] = ()  # remarks about the server
 
+    @property
+    def is_answer(self) -> bool:
+        """Whether the model answered, if only by a refusal. Other replies are not cached."""
+        return bool(self.text.strip() or self.refusal.strip())
+
 
 @dataclass(frozen=True)
 class Answer:

@@ -243,7 +243,8 @@ class OpenAIPlanner:
         """Return the cached reply to a request; None if the file is missing or corrupted."""
         with suppress(FileNotFoundError, ValueError, KeyError, TypeError):
             answer = read_json(self.cache_path(request), "the cached answer")["answer"]
-            return Reply(**{**answer, "tokens": Tokens(**answer["tokens"]), "notes": tuple(answer["notes"])})
+            reply = Reply(**{**answer, "tokens": Tokens(**answer["tokens"]), "notes": tuple(answer["notes"])})
+            return reply if reply.is_answer else None
         return None
 
     def _ask(self, questions: list[Question]) -> Generator[tuple[Question, Reply | PlannerError], None, None]:
@@ -261,7 +262,8 @@ class OpenAIPlanner:
                 if error.fatal:
                     stopped.set()
                 return question, error
-            write_json(self.cache_path(question.request), {"request": question.request, "answer": asdict(reply)})
+            if reply.is_answer:
+                write_json(self.cache_path(question.request), {"request": question.request, "answer": asdict(reply)})
             return question, reply
 
         with (
