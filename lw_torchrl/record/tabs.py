@@ -86,6 +86,11 @@ class Tabs:
         self._saved = len(self._entries)
 
     @property
+    def count(self) -> int:
+        """The number of entries."""
+        return len(self._entries)
+
+    @property
     def has_grown(self) -> bool:
         """Whether the number of entries has grown by at least a quarter since the last :meth:`send`."""
         return 4 * (len(self._entries) - self._sent) >= self._sent

@@ -167,7 +167,7 @@ def test_retry_after_is_reported_and_tries_are_counted(ask, status, value, tries
 
 def test_a_field_that_is_invalid_is_told_apart(ask):
     detail = [{"loc": ["body", "seed"], "msg": "Extra inputs are not permitted"}]
-    with pytest.raises(PlannerError, match="rejects a field of the request as invalid .*seed.*not permitted"):
+    with pytest.raises(PlannerError, match=r"rejects a field of the request as invalid .*seed.*not permitted"):
         ask(FakeServer(lambda _: Failure(422, {"detail": detail})), "push", seed=1)
 
 
