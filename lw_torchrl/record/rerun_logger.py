@@ -24,6 +24,7 @@ from torchrl.record.loggers import Logger
 
 from lw_torchrl._util.checks import Positive, check_choice, typed
 from lw_torchrl._util.files import AnyPath
+from lw_torchrl._util.text import markdown
 from lw_torchrl.evaluation.figures import plot_failures
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.language.layout import METAWORLD
@@ -198,9 +199,8 @@ class RerunLogger(Logger):
         stream = self._open()
         with self._lock:
             self._hparams.update(_flatten(cfg))
-            rows = [("key", "value"), ("---", "---"), *sorted(self._hparams.items())]
-            cells = [[text.replace("|", "\\|").replace("\n", " ") for text in row] for row in rows]
-            table = "\n".join(f"| {key} | {value} |" for key, value in cells)
+            rows = [f"| {markdown(key)} | {markdown(value)} |" for key, value in sorted(self._hparams.items())]
+            table = "\n".join(["| key | value |", "| --- | --- |", *rows])
             stream.log("hparams", rr.TextDocument(table, media_type=rr.MediaType.MARKDOWN), static=True)
             self._tabs.add_view("hparams")
             self._send()

@@ -148,7 +148,9 @@ class SwapUnmentioned(PlanAugmentation):
         flat = {name: values.reshape(number, -1) for name, values in observations.items()}
         swapped = {name: values.clone() for name, values in flat.items()}
         for item, parts in enumerate(self._parts):  # an object may have several parts, such as its old position
-            swap = (~kept[:, item] & (torch.rand(number, device=device) < self.probability)).unsqueeze(-1)
+            swap = (
+                ~kept[:, item] & (torch.rand(number, device=device, dtype=torch.float32) < self.probability)
+            ).unsqueeze(-1)
             others = torch.randint(number, (number,), device=device)
             for name, values in flat.items():
                 for part in parts:
@@ -192,7 +194,7 @@ class HideOpening(Augmentation):
             return tensordict  # there is no row to take the opening from
         opening = observation[..., self._opening]
         others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
-        hidden = torch.rand(opening.shape, device=opening.device) < self.probability
+        hidden = torch.rand(opening.shape, device=opening.device, dtype=torch.float32) < self.probability
         observation[..., self._opening] = torch.where(hidden, others, opening)
         return tensordict.copy().set(self.in_keys[0], observation)
 
@@ -235,12 +237,12 @@ class JitterTarget(PlanAugmentation):
         plans = self._read_plans(plans)
         pushes = role_table(plans, self._tables, lambda role: role.verb in ("push", "pull"))
         self.register_buffer("pushes", pushes, persistent=False)  # (T, S) bool
-        self.register_buffer("scale", std * torch.tensor([0.5, 0.5, 1.0]), persistent=False)
+        self.register_buffer("scale", std * torch.tensor([0.5, 0.5, 1.0], dtype=torch.float32), persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         active, rows = self.active(tensordict, self.in_keys[::-1])
         pushed = (active & self.table("pushes", rows.device)[rows]).any(-1, keepdim=True)
-        offset = self.table("scale", rows.device) * torch.randn(*rows.shape, 3, device=rows.device)
+        offset = self.table("scale", rows.device) * torch.randn(*rows.shape, 3, device=rows.device, dtype=torch.float32)
         return tensordict.copy().set(self.out_keys[0], torch.where(pushed, offset, 0.0))
 
 
