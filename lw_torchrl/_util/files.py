@@ -218,7 +218,7 @@ def read_json(path: AnyPath, what: str) -> dict[str, Any]:
     """Read a JSON file that holds an object. Raise a :class:`ValueError` that begins with ``what``, such as "root: the
     metadata", if the file is invalid."""
     try:
-        return parse_json(Path(path).read_bytes())
+        return parse_json(expanded(path).read_bytes())
     except ValueError as error:
         raise ValueError(f"{what} {str(path)!r} cannot be read: {error}") from error
 

@@ -80,8 +80,10 @@ class ChatClient:
         if self.address == OPENAI and not key:
             advice = f"set the environment variable {_KEY}, or pass the base_url of a server that needs no key"
             raise PlannerError(f"{model!r} at {self.address} needs a key: {advice}", fatal=True)
-        if not (key.isascii() and key.isprintable()):
-            raise PlannerError(f"the key in {_KEY} has invalid characters; set {_KEY} again", fatal=True)
+        for name in (_KEY, "OPENAI_ORG_ID", "OPENAI_PROJECT_ID"):  # these become headers of each request
+            value = os.environ.get(name, "").strip()
+            if not (value.isascii() and value.isprintable()):
+                raise PlannerError(f"the key in {name} has invalid characters; set {name} again", fatal=True)
         self._fallbacks = frozenset({"max_completion_tokens"} if self.address == OPENAI else ())
         options: Any = {"timeout": openai.Timeout(timeout, connect=min(timeout, 10.0))}
         self._is_local = _is_local(self.address)

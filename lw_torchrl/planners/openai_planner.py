@@ -13,7 +13,7 @@ from threading import Event
 from typing import Any
 
 from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_choice, check_value, counted, shown, typed
-from lw_torchrl._util.files import AnyPath, read_json, write_json
+from lw_torchrl._util.files import AnyPath, expanded, read_json, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import AnyPlans, as_plans
@@ -210,7 +210,7 @@ class OpenAIPlanner:
             else:
                 answers.append(replace(self._read(reply, question, format), cached=True))
         if out is not None:
-            write_settings(Path(out) / folder_name(name), self.settings())
+            write_settings(expanded(out) / folder_name(name), self.settings())
             for answer in answers:
                 write_answer(out, name, answer)
         errors: list[PlannerError] = []
