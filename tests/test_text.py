@@ -16,14 +16,26 @@ from lw_torchrl._util.text import markdown, printable
 from lw_torchrl.cli.main import main
 
 # Sequences that clear the screen, set the title, write to the clipboard, move the cursor or reverse the text.
-SEQUENCES = ["\x1b[2J", "\x1b]0;owned\x07", "\x1b]52;c;eA==\x1b\\", "\r", "\x08\x08", "\x9b1A", "\u202e", "\u2066", "\x7f"]
+SEQUENCES = [
+    "\x1b[2J",
+    "\x1b]0;owned\x07",
+    "\x1b]52;c;eA==\x1b\\",
+    "\r",
+    "\x08\x08",
+    "\x9b1A",
+    "\u202e",
+    "\u2066",
+    "\x7f",
+]
 
 
 @given(st.text())
 @example("".join(SEQUENCES))
 def test_printable_text_has_no_control_characters(text):
     shown = printable(text)
-    assert not any(ord(character) < 32 and character not in "\n\t" or 127 <= ord(character) < 160 for character in shown)
+    assert not any(
+        (ord(character) < 32 and character not in "\n\t") or 127 <= ord(character) < 160 for character in shown
+    )
     shown.encode()  # nothing is left that cannot be written
     assert printable(shown) == shown
 
@@ -35,7 +47,8 @@ def test_usual_text_is_unchanged(text):
 
 LINKS = [
     "[click](//evil.example/x)", "![x](http://evil.example/x.png)", "<img src=//evil.example>", "https://evil.example",
-    "www.evil.example", "<https://evil.example>", "[a]: //evil.example\n[a]", "me@evil.example", "mailto:me@evil.example",
+    "www.evil.example", "<https://evil.example>", "[a]: //evil.example\n[a]", "me@evil.example",
+    "mailto:me@evil.example",
     "`x` ![y][z]", "a | b\n|---|---|\n| c | d |", "\\[x](//evil.example)", "&#91;x](//evil.example)", "\n# heading",
 ]  # fmt: skip
 

@@ -9,6 +9,7 @@ from math import inf
 from numbers import Integral, Real
 from os import PathLike, fspath
 from os.path import expanduser
+from pathlib import Path
 from reprlib import Repr
 from types import SimpleNamespace, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -117,7 +118,7 @@ def check_value(argument: str, value: Any, hint: Any) -> Any:
         close = did_you_mean(value, map(str, choices)) if isinstance(value, str) else ""
         raise ArgumentError(f"{argument} must be {_words(hint)}, got {shown(value)}{close}")
     if isinstance(value, str | PathLike) and "PathLike" in str(hint) and fspath(value).startswith("~/"):
-        return type(value)(expanduser(value))  # a path in the user's home folder
+        return expanduser(value) if isinstance(value, str) else Path(expanduser(value))
     return _plain(value)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Mapping
 from importlib.resources import files
@@ -135,9 +136,15 @@ def _training(description: Mapping[str, Any], demonstrated: set[str]) -> str:
     rows.append(("versions", description["versions"]))
     lines = [f"- tasks: {', '.join(map(markdown, sorted(demonstrated))) or 'not recorded'}"]
     for name, row in rows:
-        if shown := [f"{key} {markdown(value)}" for key, value in row.items() if value is not None and key in _SHOWN]:
+        if shown := [f"{key} {_value(value)}" for key, value in row.items() if value is not None and key in _SHOWN]:
             lines.append(f"- {name}: {', '.join(shown)}")
     return "\n".join(lines)
+
+
+def _value(value: object) -> str:
+    """Return a value as Markdown; a list of numbers keeps its brackets."""
+    text = str(value)
+    return text if re.fullmatch(r"[-+\d.,e \[\]]*", text) else markdown(text)
 
 
 def _code(text: object) -> str:

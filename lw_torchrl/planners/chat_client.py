@@ -228,7 +228,7 @@ def _status(status: int, content: bytes) -> int:
     codes = [error.get(name) for name in ("code", "status", "status_code")] if isinstance(error, dict) else []
     for code in [*codes, body.get("code"), body.get("status")] if isinstance(body, dict) and status == 200 else ():
         if re.fullmatch("[45][0-9][0-9]", str(code)):
-            return int(code)
+            return int(str(code))
     found = (code for code, words in _STATUSES.items() if re.search(words, text[:20_000], re.IGNORECASE))
     return next(found, 502) if status == 200 else status
 
