@@ -18,7 +18,7 @@ from hashlib import sha256
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import IO, Any
 
 AnyPath = str | os.PathLike[str]
 _ABANDONED = 3600.0  # age in seconds at which a temporary folder counts as a leftover of a killed process
@@ -69,13 +69,28 @@ def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
     if _is_stream(target):
         with TemporaryDirectory() as folder:
             yield (temporary := Path(folder) / target.name)
-            with temporary.open("rb") as content, target.open("wb") as stream:
+            with temporary.open("rb") as content, _opened(target) as stream:
                 shutil.copyfileobj(content, stream)
         return
     with _staged(Path(os.path.realpath(target)), sync) as temporary:
         yield temporary
         if sync:
             flush(temporary)
+
+
+def _opened(stream: Path) -> IO[bytes]:
+    """Open a device or FIFO to write to it; raise :class:`OSError` if nobody reads the FIFO within a second."""
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            handle = os.open(stream, os.O_WRONLY | os.O_TRUNC | os.O_NONBLOCK)
+        except OSError as error:
+            if error.errno != errno.ENXIO or time.monotonic() > end:
+                raise
+            time.sleep(0.02)
+        else:
+            os.set_blocking(handle, True)
+            return os.fdopen(handle, "wb")
 
 
 def _is_stream(target: Path) -> bool:

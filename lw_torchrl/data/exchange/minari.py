@@ -57,7 +57,7 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
 
     (file,) = (folder / "data").glob("*.hdf5")
     h5py.File(file, "w", track_order=True).close()
-    _reserve(file, 2 * sum(column.nbytes for column in table.columns.values()) + 20_000 * len(table.tasks))
+    _reserve(file, 2 * sum(column.nbytes for column in table.columns.values()) + 100_000 * len(table.tasks))
 
     def episodes() -> Iterator[Any]:
         for start, end in table.spans():
@@ -73,7 +73,7 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
             bar.update(end - start)
 
     storage.update_episodes(episodes())
-    _reserve(file, 20_000 * len(table.tasks))
+    _reserve(file, 100_000 * len(table.tasks))
     storage.update_episode_metadata(
         {"task": task, "task_description": table.descriptions[task], "plan": table.plans.get(task, "")}
         for task in table.tasks
