@@ -52,6 +52,10 @@ def error(status, message, **headers):
     return Failure(status, {"error": {"message": message}}, {"retry-after-ms": "1", **headers})
 
 
+def encode(text):
+    return text.encode()
+
+
 class FakeServer:
     """A server that sends ``failures``, then ``respond(body)``, after ``wait`` seconds; it keeps requests and keys."""
 
@@ -79,7 +83,7 @@ def serving(server):
         def do_POST(self):
             body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
             reply = server.answer(body, self.headers["Authorization"])
-            content = (reply.body if isinstance(reply.body, str) else json.dumps(reply.body)).encode()
+            content = encode(reply.body if isinstance(reply.body, str) else json.dumps(reply.body))
             self.close_connection = reply.cut
             self.send_response(reply.status)
             for name, value in {"Content-Length": len(content), **reply.headers}.items():

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import re
 import signal
+import stat
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import pytest
 
@@ -53,7 +55,7 @@ def test_content_is_synced_before_the_rename(tmp_path, monkeypatch):
     target = tmp_path / "a.json"
     write_text(target, "new")
     temporary = calls[0][1]
-    assert re.fullmatch(re.escape(str(tmp_path)) + r"/\.a\.[0-9a-f]{16}\.tmp\.json", temporary)
+    assert re.fullmatch(re.escape(str(tmp_path)) + r"/\.a\.json\.[0-9a-f]{16}\.tmp/a\.json", temporary)
     assert calls == [("fsync", temporary), ("replace", str(target)), ("fsync", str(tmp_path))]
     calls.clear()
     with replacing(target, sync=False) as path:
@@ -128,6 +130,91 @@ def test_file_has_the_permissions_of_new_files(tmp_path):
     (tmp_path / "other").touch()
     write_text(tmp_path / "a.txt", "")
     assert (tmp_path / "a.txt").stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
+# ---- what stands at the name
+
+
+def test_a_link_and_a_mode_are_kept(tmp_path):
+    (tmp_path / "runs").mkdir()
+    target, link = tmp_path / "runs" / "v1.json", tmp_path / "best.json"
+    target.write_text("old")
+    target.chmod(0o640)
+    link.symlink_to("runs/v1.json")
+    write_text(link, "new")
+    assert (link.is_symlink(), target.read_text(), stat.S_IMODE(target.stat().st_mode)) == (True, "new", 0o640)
+    (tmp_path / "next.json").symlink_to("runs/v2.json")  # the file that it points to does not exist yet
+    write_text(tmp_path / "next.json", "second")
+    assert (tmp_path / "runs" / "v2.json").read_text() == "second"
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(OSError, match="loop"):
+        write_text(tmp_path / "loop", "x")
+    assert (tmp_path / "loop").is_symlink()
+    assert names(tmp_path / "runs") == ["v1.json", "v2.json"]
+
+
+def test_a_private_file_is_private_while_it_is_written(tmp_path):
+    with replacing(tmp_path / "a") as temporary:
+        temporary.write_text("secret")
+        assert stat.S_IMODE(temporary.parent.stat().st_mode) == 0o700
+
+
+@pytest.mark.parametrize("kind", [stat.S_IFIFO, stat.S_IFCHR, stat.S_IFSOCK, stat.S_IFDIR])
+def test_devices_fifos_sockets_and_folders_stay_what_they_are(tmp_path, kind):
+    path = tmp_path / "place.png"
+    if kind == stat.S_IFDIR:
+        path.mkdir()
+    elif kind == stat.S_IFCHR and os.geteuid() != 0:
+        pytest.skip("only root can make a device")
+    else:
+        os.mknod(path, 0o600 | kind, os.makedev(1, 3))  # if a device, one like /dev/null
+    reader = ThreadPoolExecutor(1).submit(path.read_text) if kind == stat.S_IFIFO else None
+    with suppress(OSError):
+        write_text(path, "text")
+        assert kind in (stat.S_IFIFO, stat.S_IFCHR)
+    assert stat.S_IFMT(path.stat().st_mode) == kind
+    assert reader is None or reader.result(10) == "text"
+    assert names(tmp_path) == ["place.png"]
+
+
+@pytest.mark.parametrize("name", ["a" * 250 + ".json", "ä" * 125 + ".json", "n" * 255])
+def test_names_up_to_the_systems_limit(tmp_path, name):
+    with locked(tmp_path / name, "out"):
+        write_text(tmp_path / name, "new")
+    assert names(tmp_path) == [name]
+    with replacing_folder(tmp_path / name[:-1]) as folder:
+        (folder / "file").touch()
+    assert (tmp_path / name[:-1] / "file").is_file()
+
+
+def test_the_home_folder_is_expanded(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    write_text("~/runs/a.txt", "a")
+    assert (tmp_path / "home" / "runs" / "a.txt").read_text() == "a"
+    write_text("~a.txt", "b")
+    assert names(tmp_path) == ["home", "~a.txt"]
+
+
+def test_standard_output_is_written_to(tmp_path):
+    code = f"import importlib.util as u; s = u.spec_from_file_location('f', {_files.__file__!r})\n"
+    code += "f = u.module_from_spec(s); s.loader.exec_module(f); f.write_text('/dev/stdout', 'text')"
+    command = [sys.executable, "-c", code]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "text"
+    with (tmp_path / "out.txt").open("w") as out:
+        subprocess.run(command, stdout=out, check=True)
+        assert os.fstat(out.fileno()).st_nlink == 1
+    assert (tmp_path / "out.txt").read_text() == "text"
+
+
+def test_leftovers_of_killed_processes_are_removed(tmp_path):
+    for name in ("a.txt", "b.txt"):
+        left = tmp_path / f".{name}.{'0' * 16}.tmp"
+        left.mkdir()
+        (left / name).touch()
+        os.utime(left, (1.0, 1.0))
+    write_text(tmp_path / "a.txt", "new")
+    assert names(tmp_path) == [f".b.txt.{'0' * 16}.tmp", "a.txt"]
 
 
 def test_folder_appears_whole_or_not_at_all(tmp_path):

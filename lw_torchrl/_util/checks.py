@@ -7,6 +7,9 @@ from difflib import get_close_matches
 from functools import cache, wraps
 from math import inf
 from numbers import Integral, Real
+from os import PathLike, fspath
+from os.path import expanduser
+from pathlib import Path
 from reprlib import Repr
 from types import SimpleNamespace, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -106,7 +109,7 @@ def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
 
 def check_value(argument: str, value: Any, hint: Any) -> Any:
     """Return ``value`` (NumPy scalars as Python numbers) if it matches a type hint; otherwise raise an
-    :class:`ArgumentError`.
+    :class:`ArgumentError`. A path that begins with "~/" is expanded.
     """
     if not checker(hint)(value):
         choices = [
@@ -114,6 +117,8 @@ def check_value(argument: str, value: Any, hint: Any) -> Any:
         ]
         close = did_you_mean(value, map(str, choices)) if isinstance(value, str) else ""
         raise ArgumentError(f"{argument} must be {_words(hint)}, got {shown(value)}{close}")
+    if isinstance(value, str | PathLike) and "PathLike" in str(hint) and fspath(value).startswith("~/"):
+        return expanduser(value) if isinstance(value, str) else Path(expanduser(value))
     return _plain(value)
 
 

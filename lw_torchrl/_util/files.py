@@ -8,17 +8,21 @@ import json
 import os
 import secrets
 import shutil
+import stat
 import sys
 import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from hashlib import sha256
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import IO, Any
 
 AnyPath = str | os.PathLike[str]
-_ABANDONED = 3600.0  # age in seconds at which a temporary file counts as a leftover of a killed process
+_ABANDONED = 3600.0  # age in seconds at which a temporary folder counts as a leftover of a killed process
+_LONGEST = 255  # maximum number of bytes in the name of a file, in all common file systems
 PATIENCE = 1.0  # seconds that `locked` waits for another writer to finish
 
 _SHIPPED = Path(__file__).parents[1] / "training" / "data"
@@ -38,53 +42,111 @@ def absent_policy(path: AnyPath, writer: str = "train") -> str:
     return f"no file {str(path)!r}; create it with `lw-torchrl {writer}`{hint}"
 
 
+def expanded(path: AnyPath) -> Path:
+    """Return a path with a leading "~/" replaced by the user's home folder."""
+    text = os.fspath(path)
+    return Path(os.path.expanduser(text) if text == "~" or text.startswith("~/") else text)
+
+
+def companion(path: Path, ending: str, *, stem: str | None = None, hidden: bool = False) -> Path:
+    """Return the path of a file next to ``path``, with the same name or ``stem`` and an ending; a name that would be
+    too long for a file system is replaced by a hash."""
+    name, dot = path.name if stem is None else stem, "." * hidden
+    if len(os.fsencode(dot + name + ending)) > _LONGEST:
+        name = sha256(os.fsencode(name)).hexdigest()[:32]
+    return path.with_name(dot + name + ending)
+
+
 @contextmanager
 def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename the file to ``path`` when the block ends without an error.
 
     If the process is killed, ``path`` is either the complete old file or the complete new file. With ``sync``, which
-    takes about 10 ms, the same is true if the machine crashes.
+    takes about 10 ms, the same is true if the machine crashes. The file keeps the old file's mode. A link is kept, and
+    the file that it points to is replaced. A device or FIFO, such as /dev/stdout, is written to.
     """
-    target = Path(os.path.realpath(path))  # a symbolic link is kept, and the file it points to is replaced
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if sync:  # without sync, there may be many small files, which would make listing the folder slow
-        _remove_abandoned(target)
-    # Keep the suffix, because some writers choose the file format by the suffix.
-    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(8)}.tmp{target.suffix}")
-    try:
+    target = expanded(path)
+    if _is_stream(target):
+        with TemporaryDirectory() as folder:
+            yield (temporary := Path(folder) / target.name)
+            with temporary.open("rb") as content, _opened(target) as stream:
+                shutil.copyfileobj(content, stream)
+        return
+    with _staged(Path(os.path.realpath(target)), sync) as temporary:
         yield temporary
         if sync:
             flush(temporary)
-        os.replace(temporary, target)
-        if sync:
-            flush(target.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
-def _remove_abandoned(target: Path) -> None:
-    """Remove temporary files that killed processes left behind."""
-    for left in target.parent.glob(f".{glob.escape(target.stem)}.*.tmp{target.suffix}"):
-        with suppress(OSError):
-            if time.time() - left.stat().st_mtime > _ABANDONED:
-                left.unlink()
+def _opened(stream: Path) -> IO[bytes]:
+    """Open a device or FIFO to write to it; raise :class:`OSError` if nobody reads the FIFO within a second."""
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            handle = os.open(stream, os.O_WRONLY | os.O_TRUNC | os.O_NONBLOCK)
+        except OSError as error:
+            if error.errno != errno.ENXIO or time.monotonic() > end:
+                raise
+            time.sleep(0.02)
+        else:
+            os.set_blocking(handle, True)
+            return os.fdopen(handle, "wb")
+
+
+def _is_stream(target: Path) -> bool:
+    """Return whether a path is a device or FIFO; raise :class:`OSError` if a file cannot be written there at all."""
+    try:
+        mode = target.stat().st_mode
+    except FileNotFoundError:
+        return False
+    if stat.S_ISREG(mode):  # a redirected /dev/stdout is a regular file
+        return str(target).startswith(("/dev/std", "/dev/fd/", "/proc/"))
+    if not (stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)):
+        error = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
+        raise OSError(error, os.strerror(error), str(target))
+    return True
 
 
 @contextmanager
 def replacing_folder(path: AnyPath) -> Iterator[Path]:
     """Yield a temporary folder, and rename the folder to ``path``, which must not exist or be empty, when the block
     ends."""
-    target = Path(path).absolute()
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
-    temporary.mkdir(parents=True)
-    try:
+    with _staged(expanded(path).absolute()) as temporary:
+        temporary.mkdir()
         yield temporary
         for entry in [*temporary.rglob("*"), temporary]:
             flush(entry)
+
+
+@contextmanager
+def _staged(target: Path, sync: bool = True) -> Iterator[Path]:
+    """Yield a path with the target's name in a private temporary folder, and rename it to ``target`` at the end."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if sync:  # without sync, there may be many small files, which would make listing the folder slow
+        _remove_abandoned(target)
+    folder = companion(target, f".{secrets.token_hex(8)}.tmp", hidden=True)
+    folder.mkdir(mode=0o700)
+    try:
+        yield (temporary := folder / target.name)
+        with suppress(FileNotFoundError):
+            old = target.stat()
+            with suppress(OSError):  # only root may give files away
+                os.chown(temporary, old.st_uid, old.st_gid)
+            temporary.chmod(stat.S_IMODE(old.st_mode))
         os.replace(temporary, target)
-        flush(target.parent)
+        if sync:
+            flush(target.parent)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _remove_abandoned(target: Path) -> None:
+    """Remove temporary folders that killed processes left behind."""
+    name = companion(target, f".{'0' * 16}.tmp", hidden=True).name
+    for left in target.parent.glob(f"{glob.escape(name.removesuffix('0' * 16 + '.tmp'))}*.tmp"):
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime > _ABANDONED:
+                shutil.rmtree(left)
 
 
 def flush(path: Path) -> None:
@@ -116,8 +178,8 @@ def locked(
     """
     from filelock import FileLock, Timeout
 
-    place = Path(path)
-    lock = FileLock(place / ".lock" if folder else place.with_name(f".{place.name}.lock"))
+    place = expanded(path)
+    lock = FileLock(place / ".lock" if folder else companion(place, ".lock", hidden=True))
     Path(lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
     try:
         lock.acquire(timeout=PATIENCE)
@@ -171,7 +233,7 @@ def read_json(path: AnyPath, what: str) -> dict[str, Any]:
     """Read a JSON file that holds an object. Raise a :class:`ValueError` that begins with ``what``, such as "root: the
     metadata", if the file is invalid."""
     try:
-        return parse_json(Path(path).read_bytes())
+        return parse_json(expanded(path).read_bytes())
     except ValueError as error:
         raise ValueError(f"{what} {str(path)!r} cannot be read: {error}") from error
 

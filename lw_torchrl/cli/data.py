@@ -279,11 +279,14 @@ def _show_recording(output: Output, path: Path) -> Output:
     """List the episodes of a recording and the number of time steps of each."""
     from rerun.chunk import RrdReader
 
+    from lw_torchrl.record.viewer import damaged, readable
+
     steps: dict[str, int] = {}
-    for chunk in RrdReader(path).stream():
-        episode, _, entity = str(chunk.entity_path).strip("/").partition("/")
-        if entity == "action" and not chunk.is_static:
-            steps[episode] = steps.get(episode, 0) + len(chunk)
+    with readable(path) as file, damaged(path):
+        for chunk in RrdReader(file).stream():
+            episode, _, entity = str(chunk.entity_path).strip("/").partition("/")
+            if entity == "action" and not chunk.is_static:
+                steps[episode] = steps.get(episode, 0) + len(chunk)
     output.show("recording", path, f"{path}: {path.stat().st_size / 1e6:.1f} MB")
     rows = [{"episode": episode, "steps": number} for episode, number in sorted(steps.items())]
     return output.table("episodes", rows, {"episode": "episode", "steps": "steps"})

@@ -6,9 +6,11 @@ A command is a dataclass: the docstring and the comments next to the fields are 
 from __future__ import annotations
 
 import os
+import re
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import is_dataclass
 from importlib import import_module
 from typing import Any, get_args, get_type_hints
@@ -17,6 +19,7 @@ from beartype.door import is_bearable
 
 from lw_torchrl import __version__
 from lw_torchrl._util.checks import Count, Natural, Positive, Probability, Scale, nearest
+from lw_torchrl._util.text import PrintableStream, printable
 
 # Map each command to its group, class and summary. Classes are imported later, so `lw-torchrl --help` loads no torch.
 COMMANDS = {
@@ -45,6 +48,7 @@ imports your Python module, for example to register a suite or a policy class
 
 Exit status: 0: success; 1: a bug, with a traceback; 2: an error that you can fix
 (LW_TORCHRL_TRACEBACK=1 adds the traceback); 130: stopped by Ctrl-C; 141: broken pipe."""
+_HOME = re.compile(r"^(--[\w-]+=)?~(?=/|$)")  # shells do not expand the ~ of --out=~/file
 _USER_ERRORS = (ValueError, OSError, ImportError, RuntimeError)
 _RANGES: tuple[tuple[Any, str], ...] = (
     (Count, "at least 1"), (Natural, "at least 0"), (Scale, "at least 0"), (Positive, "above 0"),
@@ -54,9 +58,18 @@ _RANGES: tuple[tuple[Any, str], ...] = (
 
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command line; raise :class:`SystemExit` unless the exit status is 0."""
+    if args is None:  # this process only runs the command
+        warnings.formatwarning = _warning_text
+    words = [_HOME.sub(_expand, word) for word in (sys.argv[1:] if args is None else args)]
     try:
-        _run(list(sys.argv[1:] if args is None else args))
+        with _messages_to_stderr() if "--json" in words else redirect_stdout(PrintableStream(sys.stdout)):
+            output = _run(words)
+        if output is not None:
+            with redirect_stdout(PrintableStream(sys.stdout)):
+                output.finish()
         sys.stdout.flush()
+        if args is None and "--json" in words:
+            os.dup2(2, 1)  # an imported module may print at exit
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python prints an error at exit
         sys.exit(141)
@@ -69,22 +82,50 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _exit(message: str, status: int) -> None:
-    print(f"lw-torchrl: {message}", file=sys.stderr)
+    print(printable(f"lw-torchrl: {message}"), file=sys.stderr)
     sys.exit(status)
 
 
-def _run(args: list[str]) -> None:
+def _expand(match: re.Match[str]) -> str:
+    return (match[1] or "") + os.path.expanduser("~")
+
+
+@contextmanager
+def _messages_to_stderr() -> Iterator[None]:
+    """Send everything that is printed to stderr, even by compiled code and other processes, until the block ends."""
+    stdout, kept = sys.stdout, None
+    with suppress(OSError, ValueError):  # a stream in memory has no number
+        number = stdout.fileno()
+        stdout.flush()
+        kept = os.dup(number)
+        os.dup2(2, number)
+    try:
+        with redirect_stdout(PrintableStream(sys.stderr)):
+            yield
+    finally:
+        if kept is not None:
+            stdout.flush()  # text that was written to sys.__stdout__
+            os.dup2(kept, number)
+            os.close(kept)
+
+
+def _warning_text(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> str:
+    return printable(f"{category.__name__}: {message}\n")
+
+
+def _run(args: list[str]) -> Any:
+    """Run a command, and return its output, which is printed at the end."""
     args = _import_modules(args)
     if args == ["--version"]:
         print(f"lw-torchrl {__version__}")
-        return
+        return None
     name = " ".join(args[:2]) if " ".join(args[:2]) in COMMANDS else " ".join(args[:1])
     inner = {other: command for other, command in COMMANDS.items() if other.startswith(f"{name} ")}
     if not name or name.startswith("-") or (inner and args[1:] in ([], ["-h"], ["--help"])):
         if name not in ("", "-h", "--help") and not inner:
             raise ValueError(f"the command must come first, got {name!r}; `lw-torchrl --help` lists the commands")
         print(_overview(inner or COMMANDS))
-        return
+        return None
     if name not in COMMANDS:
         close = nearest(" ".join(args[:2]) if inner else name, inner or COMMANDS, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
@@ -96,11 +137,7 @@ def _run(args: list[str]) -> None:
     markers = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
     command = tyro.cli(kind, prog=f"lw-torchrl {name}", args=args[1 + (" " in name) :], config=markers)
     _check_ranges(command)
-    # With --json, only the JSON document is written to stdout.
-    with redirect_stdout(sys.stderr) if getattr(command, "json", False) else nullcontext():
-        output = command.run()
-    if output is not None:
-        output.finish()
+    return command.run()
 
 
 def _check_ranges(command: Any) -> None:

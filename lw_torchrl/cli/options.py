@@ -19,6 +19,7 @@ import lw_torchrl as lw
 from lw_torchrl._util.checks import Count, counted
 from lw_torchrl._util.files import read_text
 from lw_torchrl._util.workers import start_early
+from lw_torchrl._util.text import printable
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
@@ -104,7 +105,7 @@ def _plain(value: Any) -> Any:
 
 def _cell(row: Row, column: str | Callable[[Row], Any]) -> str:
     value = row[column] if isinstance(column, str) else column(row)
-    return "" if value is None or value is False else "yes" if value is True else str(value)
+    return "" if value is None or value is False else "yes" if value is True else printable(str(value))
 
 
 def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -119,7 +120,7 @@ def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[st
         table.add_column(heading, no_wrap=not terminal or number == 0)
     for row in rows:
         table.add_row(*row)
-    console = Console(highlight=False, markup=False, width=None if terminal else 10_000)
+    console = Console(highlight=False, markup=False, color_system=None, width=None if terminal else 10_000)
     with console.capture() as capture:
         console.print(table)
     print("\n".join(line.rstrip() for line in capture.get().splitlines()))

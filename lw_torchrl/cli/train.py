@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
 from lw_torchrl._util.checks import Count, Natural, Probability, Scale, counted
+from lw_torchrl._util.files import companion
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Maybe, Output, read_evaluator
 
@@ -138,7 +139,7 @@ class Train:
         data = n_step_data = replay(n_steps=N_STEPS, gamma=GAMMA)
         device = place(actor, self.device)
         if self.loss == "advantage":
-            file = self.out.with_name(f"{self.out.stem}.value.safetensors")
+            file = companion(self.out, ".value.safetensors", stem=self.out.stem)
             value: dict[str, Any] = {"checkpoint": file, "title": "training the value"}
             advantage = learn_advantages(plans, n_step_data, config, device, **value)
             data = replay()

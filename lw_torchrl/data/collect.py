@@ -346,6 +346,6 @@ def collect_demonstrations(
             versions, files = _begin(folder, config), EpisodeFiles(partial)
             kept = run_missing_episodes(config, actor, files, num_envs, suite, progress, workers)
             _assemble(folder, config, versions, files, kept)
-        for left in (partial, *folder.glob(".metadata.*.tmp.json")):  # a killed process may have left the latter
-            shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
+        for left in (partial, *folder.glob(".metadata.*.tmp")):  # a killed process may have left the latter
+            shutil.rmtree(left, ignore_errors=True)
     return dataset.read_metadata(folder)

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils.data import get_worker_info
 from torchrl.data import ImmutableDatasetWriter, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
-from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.samplers import Sampler, SliceSampler
 from torchrl.envs import Compose, MultiStepTransform, Reward2GoTransform, Transform
 
 from lw_torchrl._util.checks import Count, Natural, Probability, typed
@@ -29,6 +29,10 @@ from lw_torchrl.data.samplers import to_device_of
 from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label, select
 
 _FILE = "buffer.safetensors"
+_OVER_TIME = {  # TorchRL's transforms that read several time steps of an episode; not all versions have all
+    *("ActionChunkTransform", "BurnInTransform", "CatFrames", "NextStateReconstructor", "RandomCropTensorDict"),
+    *("RewardSum", "TimeMaxPool"),
+}
 
 
 class DatasetStorage(TensorStorage):
@@ -85,6 +89,26 @@ def _check_transform(transform: Any) -> None:
         raise ValueError(f"transform: MultiStepTransform does not change samples; use {options} instead")
     elif isinstance(transform, Reward2GoTransform):
         raise ValueError("transform: Reward2GoTransform does not change samples; use add_column for reward-to-go")
+
+
+def _check_time(sampler: Sampler, *transforms: Any) -> None:
+    """Raise ValueError for a transform over time if the rows of a sample do not follow each other in time.
+
+    A SliceSampler's samples are flat, so that a part before must reshape them, or episodes would be mixed.
+    """
+    is_reshaped = False
+    for part in (part for transform in transforms if isinstance(transform, Transform) for part in transform.modules()):
+        kinds = {kind.__name__ for kind in type(part).__mro__}
+        is_reshaped |= bool(kinds & {"BatchSizeTransform", "_CallableTransform"})
+        if (names := kinds & _OVER_TIME) and not (is_reshaped and isinstance(sampler, SliceSampler)):
+            working = 'sampler=SliceSampler(slice_len=16, traj_key=("collector", "traj_ids"))'
+            slices, rows = (
+                f"BatchSizeTransform(reshape_fn=lambda rows: rows.reshape({shape}))" for shape in ("-1, 16", -1)
+            )
+            raise ValueError(
+                f"transform: {names.pop()} reads consecutive time steps, but the rows of a sample are of different "
+                f"episodes; use {working} and transform=Compose({slices}, ..., {rows})"
+            )
 
 
 class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
@@ -166,6 +190,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         storage = DatasetStorage(loaded, sha256(shown.encode()).hexdigest())
         kwargs |= {"sampler": sampler, "batch_size": batch_size, "transform": transform}
         super().__init__(storage=storage, writer=ImmutableDatasetWriter(), **kwargs)
+        _check_time(self.sampler, self.transform)
 
     def sample(self, batch_size: int | None = None, return_info: bool = False, include_info: bool | None = None) -> Any:
         """Draw a minibatch; see :meth:`torchrl.data.TensorDictReplayBuffer.sample`."""
@@ -176,11 +201,22 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
 
     def set_sampler(self, sampler: Sampler) -> Sampler:
         """Set a sampler, which uses the buffer's generator; in a DataLoader worker, call ``set_rng`` afterwards."""
+        _check_time(sampler, getattr(self, "_transform", None))
         before = super().set_sampler(sampler)
         # The workers of a DataLoader have equal copies of the generator, so that all would draw the same rows.
         if get_worker_info() is None:
             self.set_rng(self._rng)
         return before
+
+    def append_transform(self, transform: Transform, **kwargs: Any) -> Any:
+        """Append a transform; see :meth:`torchrl.data.ReplayBuffer.append_transform`."""
+        _check_time(self.sampler, self.transform, transform)
+        return super().append_transform(transform, **kwargs)
+
+    def insert_transform(self, index: int, transform: Transform, **kwargs: Any) -> Any:
+        """Insert a transform; see :meth:`torchrl.data.ReplayBuffer.insert_transform`."""
+        _check_time(self.sampler, *self.transform[:index], transform)
+        return super().insert_transform(index, transform, **kwargs)
 
     def add_column(self, name: str, values: Tensor, *, of: LanguageWorldExperienceReplay | None = None) -> None:
         """Add a column ``name`` to the samples, for example the advantage of each row; the values are kept in memory.

@@ -146,7 +146,7 @@ class LanguageWorldEnv(EnvBase):
         index = ... if batch_size is None else 0
         self.observation_spec = observation_spec(self._rows.task_id, self.layout)[index].to(self.device)
         self.action_spec = action_spec(num_envs, self.layout)[index].to(self.device)
-        self.reward_spec = Unbounded((num_envs, 1))[index].to(self.device)
+        self.reward_spec = Unbounded((num_envs, 1), dtype=torch.float32)[index].to(self.device)
         self.done_spec = done_spec(num_envs)[index].to(self.device)
         make = self.suite.make_engine if engine is None else partial(make_engine, engine)
         self._make_engine = partial(make, list(self.row_tasks), reward=reward, num_threads=num_threads)

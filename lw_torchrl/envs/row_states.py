@@ -60,7 +60,7 @@ def observation_spec(task_id: Tensor, layout: Layout) -> Composite:
     n = len(task_id)
     ids = len(MT50) if int(task_id.max()) < len(MT50) else 2**32  # a custom task's id is a hash
     return Composite(
-        observation=Unbounded((n, layout.size)),
+        observation=Unbounded((n, layout.size), dtype=torch.float32),
         task_id=TaskIds(ids, task_id),
         episode=Unbounded((n,), dtype=torch.int64),
         success=_flag(n),
@@ -71,7 +71,7 @@ def observation_spec(task_id: Tensor, layout: Layout) -> Composite:
 
 
 def action_spec(n: int, layout: Layout) -> Bounded:
-    return Bounded(-1.0, 1.0, (n, layout.action_size))
+    return Bounded(-1.0, 1.0, (n, layout.action_size), dtype=torch.float32)
 
 
 def done_spec(n: int) -> Composite:

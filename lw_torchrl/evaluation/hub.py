@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Mapping
 from importlib.resources import files
@@ -12,6 +13,7 @@ from typing import Any
 
 from lw_torchrl._util.checks import counted, typed
 from lw_torchrl._util.files import AnyPath, replacing, shipped_policy, write_text
+from lw_torchrl._util.text import markdown, printable
 from lw_torchrl.evaluation.result import EvaluationResult, wilson_interval
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.training.checkpoint import demonstrated_tasks, load_actor, policy_file, read_description
@@ -87,11 +89,11 @@ def describe_policy(policy: AnyPath, result: EvaluationResult | None = None, *, 
         raise ValueError(f"result contains tasks that the policy does not know: {', '.join(sorted(unknown))}")
     limits = [f"- {counted(len(tasks - demonstrated), 'task')} had no demonstrations."] * bool(tasks - demonstrated)
     rates = {} if result is None else result.success_once
-    if weak := [f"{task} ({rate:.2f})" for task, rate in rates.items() if rate is not None and rate < 0.8]:
+    if weak := [f"{markdown(task)} ({rate:.2f})" for task, rate in rates.items() if rate is not None and rate < 0.8]:
         limits.append(f"- Success below 0.8: {', '.join(weak)}.")
     texts = files("lw_torchrl.evaluation") / "data"
     return Template((texts / "card.md").read_text("utf-8")).substitute(
-        name=Path(policy).stem,
+        name=markdown(Path(policy).stem),
         kind=_kind(description["actor"]),
         tasks=counted(len(tasks), "task"),
         demonstrated=len(demonstrated),
@@ -119,9 +121,9 @@ def _kind(actor: Mapping[str, Any]) -> str:
     members = actor.get("options", {}).get("members", ())
     networks = f" of {counted(len(members), 'network')}" if members else ""
     module, _, kind = actor["class"].rpartition(":")
-    hint = f" (import {module} first)" if module else ""
+    hint = f" (import {markdown(module)} first)" if module else ""
     conditioned = "conditioned on plans in English" if actor.get("plans") else "of fixed tasks"
-    return f"{conditioned}: `{kind}`{networks}{hint}"
+    return f"{conditioned}: {_code(kind)}{networks}{hint}"
 
 
 def _training(description: Mapping[str, Any], demonstrated: set[str]) -> str:
@@ -132,18 +134,31 @@ def _training(description: Mapping[str, Any], demonstrated: set[str]) -> str:
     learned = {"loss": loss["class"], "reward": description["replay"].get("reward")} if loss else {}
     rows.append(("training", learned | training | ({"seed": run["seed"]} if "seed" in run else {})))
     rows.append(("versions", description["versions"]))
-    lines = [f"- tasks: {', '.join(sorted(demonstrated)) or 'not recorded'}"]
+    lines = [f"- tasks: {', '.join(map(markdown, sorted(demonstrated))) or 'not recorded'}"]
     for name, row in rows:
-        if shown := [f"{key} {value}" for key, value in row.items() if value is not None and key in _SHOWN]:
+        if shown := [f"{key} {_value(value)}" for key, value in row.items() if value is not None and key in _SHOWN]:
             lines.append(f"- {name}: {', '.join(shown)}")
     return "\n".join(lines)
+
+
+def _value(value: object) -> str:
+    """Return a value as Markdown; a list of numbers keeps its brackets."""
+    text = str(value)
+    return text if re.fullmatch(r"[-+\d.,e \[\]]*", text) else markdown(text)
+
+
+def _code(text: object) -> str:
+    """Return a Markdown code span, in which nothing is a link."""
+    return f"`{printable(str(text)).replace('`', '')}`"
 
 
 def _success(result: EvaluationResult) -> str:
     config, runs = result.config, len(result.episodes)
     solved = sum(episode.success for episode in result.episodes)
     low, high = wilson_interval(solved, runs)
-    rows = "".join(f"| {task} | {rate:.2f} |\n" for task, rate in result.success_once.items() if rate is not None)
+    rows = "".join(
+        f"| {markdown(task)} | {rate:.2f} |\n" for task, rate in result.success_once.items() if rate is not None
+    )
     return (
         f"{counted(config['episodes_per_task'], 'episode')} of each task, seed {config['seed']}, action noise "
         f"{config['noise_scale']}, success at any step, one training seed: {solved} of {runs} episodes succeeded, "

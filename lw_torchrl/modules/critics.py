@@ -68,7 +68,9 @@ class Value(RenamedInputs):
         self.heads = nn.ModuleList(heads)
         if (size := encoding_width(trunk)) is not None:
             for head in heads:
-                materialize(head, torch.zeros(1, size + self.layout.action_size * len(self._also_read)))
+                materialize(
+                    head, torch.zeros(1, size + self.layout.action_size * len(self._also_read), dtype=torch.float32)
+                )
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

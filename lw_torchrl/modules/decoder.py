@@ -151,7 +151,7 @@ def as_decoder(decoder: nn.Module, trunk: TensorDictSequential, out_keys: Keys |
     width = encoding_width(trunk)
     network = decoder.network if isinstance(decoder, Decode) else decoder
     if width is not None and not isinstance(network, TensorDictModuleBase):
-        materialize(network, torch.zeros(1, width))
+        materialize(network, torch.zeros(1, width, dtype=torch.float32))
     if isinstance(decoder, TensorDictModuleBase):
         if out_keys is not None and list(out_keys) != list(decoder.out_keys_source):
             raise ValueError(f"out_keys must be None or the decoder's own {decoder.out_keys_source}, got {out_keys}")
@@ -159,7 +159,7 @@ def as_decoder(decoder: nn.Module, trunk: TensorDictSequential, out_keys: Keys |
     decode = Decode(decoder, in_keys=encoding_keys(trunk), out_keys=("action",) if out_keys is None else out_keys)
     if width is not None and len(decode.out_keys) == 1:  # several outputs are parameters of a distribution
         _, _, layout = trunk_attributes(trunk)
-        action, size = probe(decoder, torch.zeros(1, width)), layout.action_size
+        action, size = probe(decoder, torch.zeros(1, width, dtype=torch.float32)), layout.action_size
         if action.shape[-1:] != (size,):
             raise ValueError(f"decoder must return actions (B, {size}) from (B, {width}), got {tuple(action.shape)}")
     return decode

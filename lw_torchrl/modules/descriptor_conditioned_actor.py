@@ -61,7 +61,7 @@ class TaskLatent(Part):
         self.tasks, self.layout = tuple(self.definitions), one_layout(self.definitions.values())
         self.condition, self.text_encoder = condition, text_encoder
         if text_encoder is None and condition == "one-hot":
-            vectors = torch.eye(len(self.tasks))
+            vectors = torch.eye(len(self.tasks), dtype=torch.float32)
         else:
             vectors = encoded([task.description for task in self.definitions.values()], text_encoder)
         self.index = TaskIndex(task_ids(self.tasks))

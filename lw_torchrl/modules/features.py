@@ -113,9 +113,9 @@ class ObservationFeatures(Features):
 
         self.kind = kind
         self.layout: Layout = METAWORLD if layout is None else check_value("layout", layout, Layout)
-        self.width = _KINDS[kind](torch.zeros(self.layout.size), self.layout).shape[-1]
-        self.register_buffer("mean", torch.zeros(self.width))
-        self.register_buffer("std", torch.ones(self.width))
+        self.width = _KINDS[kind](torch.zeros(self.layout.size, dtype=torch.float32), self.layout).shape[-1]
+        self.register_buffer("mean", torch.zeros(self.width, dtype=torch.float32))
+        self.register_buffer("std", torch.ones(self.width, dtype=torch.float32))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -230,7 +230,7 @@ def as_features(features: nn.Module | None, layout: Layout, noise: float = 0.0) 
     if isinstance(features, TensorDictModuleBase):
         return features
     module: Any = TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
-    module.width = probe(features, torch.zeros(1, layout.size)).shape[-1]
+    module.width = probe(features, torch.zeros(1, layout.size, dtype=torch.float32)).shape[-1]
     return module
 
 

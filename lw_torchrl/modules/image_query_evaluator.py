@@ -31,7 +31,7 @@ class SmallImageEncoder(nn.Module):
         super().__init__()
         self.fine = nn.Sequential(_conv(3, 16, stride=2), _conv(16, 24))
         self.coarse = nn.Sequential(_conv(24, 48, stride=2), _conv(48, 48), _conv(48, 48))
-        self.joined = nn.Conv2d(24 + 48, 32, 1)
+        self.joined = nn.Conv2d(24 + 48, 32, 1, dtype=torch.float32)
 
     def forward(self, pictures: Tensor) -> Tensor:
         fine = self.fine(pictures - 0.5)
@@ -40,7 +40,11 @@ class SmallImageEncoder(nn.Module):
 
 
 def _conv(before: int, after: int, stride: int = 1) -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(before, after, 3, stride, 1), nn.GroupNorm(4, after), nn.ReLU())
+    return nn.Sequential(
+        nn.Conv2d(before, after, 3, stride, 1, dtype=torch.float32),
+        nn.GroupNorm(4, after, dtype=torch.float32),
+        nn.ReLU(),
+    )
 
 
 class PointingNetwork(ClauseNetwork):
@@ -58,12 +62,12 @@ class PointingNetwork(ClauseNetwork):
     def __init__(self, encoder: nn.Module, features: int, *, cameras: int, names: int, **trunk: Any) -> None:
         super().__init__(**trunk)
         self.encoder, self.cameras = encoder, cameras
-        self.key = nn.Conv2d(features, KEYS, 1)
-        self.seen = nn.Conv2d(features, _KEPT, 1)
-        self.landmarks = nn.Conv2d(features, _LANDMARKS, 1)
-        self.names = nn.Embedding(names, KEYS)
+        self.key = nn.Conv2d(features, KEYS, 1, dtype=torch.float32)
+        self.seen = nn.Conv2d(features, _KEPT, 1, dtype=torch.float32)
+        self.landmarks = nn.Conv2d(features, _LANDMARKS, 1, dtype=torch.float32)
+        self.names = nn.Embedding(names, KEYS, dtype=torch.float32)
         self.place = MLP(self.numbers, width=self.width, depth=2)
-        materialize(self.place, torch.zeros(1, cameras * (2 + _KEPT + 2 * _LANDMARKS) + KEYS))
+        materialize(self.place, torch.zeros(1, cameras * (2 + _KEPT + 2 * _LANDMARKS) + KEYS, dtype=torch.float32))
 
     def forward(self, seen: Tensor, clauses: Clauses) -> Tensor:
         """Return logits (B, Q) of clauses (B, Q) from images (B, H, W·C, 3) uint8, with C camera views side by side."""
@@ -91,7 +95,7 @@ class PointingNetwork(ClauseNetwork):
         height, width = features.shape[-2:]
         scores = torch.einsum("nk,bkp->bnp", objects, self.key(features).flatten(-2))
         attention = (_SHARP / sqrt(KEYS) * scores).softmax(-1)
-        axes = [torch.linspace(-1.0, 1.0, size, device=seen.device) for size in (height, width)]
+        axes = [torch.linspace(-1.0, 1.0, size, device=seen.device, dtype=seen.dtype) for size in (height, width)]
         grid = torch.stack(torch.meshgrid(*axes, indexing="ij")).flatten(-2)
         values = torch.cat((grid.expand(len(features), -1, -1), self.seen(features).flatten(-2)), -2)
         attended = torch.einsum("bnp,bfp->bnf", attention, values)  # (B·C, N, 2 + 16)
@@ -187,7 +191,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
 @torch.no_grad()
 def _num_features(encoder: nn.Module, name: str, height: int, width: int) -> int:
     """Return F, the number of channels of an encoder's feature map."""
-    features = encoder(torch.zeros(1, 3, height, width))
+    features = encoder(torch.zeros(1, 3, height, width, dtype=torch.float32))
     is_tensor = isinstance(features, Tensor)
     if not is_tensor or features.dim() != 4 or len(features) != 1 or not features.is_floating_point():
         got = tuple(features.shape) if is_tensor else type(features).__name__

@@ -43,6 +43,7 @@ class MLP(TorchRLMLP):
             norm_class=nn.LayerNorm if layer_norm else None,
             norm_kwargs=[{"normalized_shape": cells} for cells in widths] if layer_norm else None,
         )
+        self.float()  # whatever torch.get_default_dtype() is
 
 
 @torch.no_grad()
@@ -219,7 +220,7 @@ class NamedParts(RenamedInputs, TensorDictSequential):
 def action_spec(key: NestedKey, layout: Layout) -> Composite:
     """Return the spec of a layout's actions, (A,) float32 in [-1, 1]."""
     spec = Composite()
-    spec[key] = Bounded(-1.0, 1.0, (layout.action_size,))
+    spec[key] = Bounded(-1.0, 1.0, (layout.action_size,), dtype=torch.float32)
     return spec
 
 

@@ -333,7 +333,7 @@ class ClauseNetwork(nn.Module):
             activation_class=nn.ReLU,
             activate_last_layer=True,
         )
-        self.predicates = nn.Embedding(predicates, width + 1)
+        self.predicates = nn.Embedding(predicates, width + 1, dtype=torch.float32)
 
     def forward(self, observation: Tensor, clauses: Clauses) -> Tensor:
         """Return the logits (B, C), in [-30, 30], of clauses (B, C) for observations (B, 39)."""

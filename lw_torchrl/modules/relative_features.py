@@ -62,19 +62,19 @@ class _RelativePositions(Features):
         constants = [0.0]
         shape = (len(plans), plans.num_steps, number, 3)
         self.layout, size = plans.layout, plans.layout.size
-        index, offset = torch.full((2, *shape), size), torch.zeros(shape)
+        index, offset = torch.full((2, *shape), size), torch.zeros(shape, dtype=torch.float32)
         for task, plan in plans.items():
             for step, pairs_of_step in enumerate(pairs(plan)):
                 for place, pair in enumerate(pairs_of_step):
                     at = (self.tables.index.row(task), step, place)
                     for side, item in enumerate(pair):
                         index[(side, *at)] = torch.tensor(coordinate_indices(item.position, constants, size))
-                        offset[at] += torch.tensor(item.offset) * (2 * side - 1)
+                        offset[at] += torch.tensor(item.offset, dtype=torch.float32) * (2 * side - 1)
         # The tables are computed from the plans, so the state_dict does not need them.
         self.register_buffer("begin", index[0], persistent=False)
         self.register_buffer("end", index[1], persistent=False)
         self.register_buffer("offset", offset, persistent=False)
-        self.register_buffer("constants", torch.tensor(constants), persistent=False)
+        self.register_buffer("constants", torch.tensor(constants, dtype=torch.float32), persistent=False)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -209,11 +209,14 @@ class RoleFeatures(_RelativePositions):
         self.width += 3
         shape = len(plans), plans.num_steps
         at_contact, acts, lifts = (torch.zeros(shape, dtype=torch.bool) for _ in range(3))
-        direction = torch.zeros(*shape, 3)
+        direction = torch.zeros(*shape, 3, dtype=torch.float32)
         for task, plan in plans.items():
             for number, role in enumerate(_roles(plan)):
                 at = (self.tables.index.row(task), number)
-                by_hand, way = role.moved == GRIPPER, torch.tensor(VECTORS.get(role.direction or "", (0.0,) * 3))
+                by_hand, way = (
+                    role.moved == GRIPPER,
+                    torch.tensor(VECTORS.get(role.direction or "", (0.0,) * 3), dtype=torch.float32),
+                )
                 at_contact[at] = by_hand and _is_first(plan, role.target)
                 touches = role.verb in ("close", "pull") or (role.verb == "push" and role.manner == "push")
                 acts[at] = _is_first(plan, role.moved) or (at_contact[at] and touches)
@@ -226,7 +229,7 @@ class RoleFeatures(_RelativePositions):
             self.register_buffer(name, table, persistent=False)
         self.ahead = _RelativePositions(plans, _ahead, 1)
         self.attention = PlanAttention(plans)
-        self.register_buffer("contact", torch.zeros(len(plans), 3))
+        self.register_buffer("contact", torch.zeros(len(plans), 3, dtype=torch.float32))
         self.register_buffer("demonstrated", torch.zeros(len(plans), dtype=torch.bool))
         self.register_buffer("fitted", torch.tensor(False))
         self._sharing: WeakSet[RoleFeatures] = WeakSet([self])  # features of actors that share weights

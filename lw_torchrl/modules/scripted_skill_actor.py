@@ -108,7 +108,11 @@ class ScriptedSkillActor(Part):
         if self.select == "mix":
             return active / active.sum(-1, keepdim=True)
         # Noise in [0, 1) orders the active steps at random, and never ranks an inactive step above an active step.
-        noise = torch.rand(active.shape, generator=self._generator).to(active.device) if self.draws else 0.0
+        noise = (
+            torch.rand(active.shape, generator=self._generator, dtype=torch.float32).to(active.device)
+            if self.draws
+            else 0.0
+        )
         return one_hot((noise + active).argmax(-1), steps).float()
 
     def skill_actions(self, tensordict: TensorDictBase) -> Tensor:

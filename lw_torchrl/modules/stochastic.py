@@ -70,7 +70,7 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         action = tuple(action) if isinstance(action, list) else action  # JSON has no tuples
         loc, scale = decoder.out_keys
         if isinstance(decoder, Decode) and (width := encoding_width(trunk)) is not None:
-            materialize(decoder.network, torch.zeros(1, width))
+            materialize(decoder.network, torch.zeros(1, width, dtype=torch.float32))
         sampler = ProbabilisticTensorDictModule(
             in_keys={"loc": loc, "scale": scale},
             out_keys=[action],
@@ -109,7 +109,7 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         options = {**old.config, "squash": distribution == "normal" and old.squash, "init_std": init_std}
         with torch.random.fork_rng(devices=[]):  # the new weights are overwritten: keep the global random state
             decoder = GaussianDecoder(**options)
-            materialize(decoder, torch.zeros(1, old[0].weight.shape[-1]))
+            materialize(decoder, torch.zeros(1, old[0].weight.shape[-1], dtype=old[0].weight.dtype))
         decoder.to(next(old.parameters())).copy_from(old)
         trunk = copy.deepcopy(actor.trunk)
         for part in trunk.modules():

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from lw_torchrl._util.checks import Count, check_choice, check_value, counted, differences, shown, typed, unknown_name
-from lw_torchrl._util.files import AnyPath, read_json, read_text, write_json, write_text
+from lw_torchrl._util.files import AnyPath, expanded, read_json, read_text, write_json, write_text
 from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
 from lw_torchrl.language.nearest import StepMapper
 from lw_torchrl.language.plan_decoding import DecodedPlan, decode_as, decode_plan
@@ -62,6 +62,11 @@ class Reply:
     refusal: str = ""  # the model's refusal; "" if the model answered
     tokens: Tokens = field(default_factory=Tokens)
     notes: tuple[str, ...] = ()  # remarks about the server
+
+    @property
+    def is_answer(self) -> bool:
+        """Whether the model answered, if only by a refusal. Other replies are not cached."""
+        return bool(self.text.strip() or self.refusal.strip())
 
 
 @dataclass(frozen=True)
@@ -136,7 +141,7 @@ def folder_name(model: str) -> str:
 @typed
 def answer_path(folder: AnyPath, model: str, format: str, task: str, attempt: int) -> Path:
     """Return the path of the file for a model's answer."""
-    return Path(folder) / folder_name(model) / format / f"{task}-{attempt}.{PLAN_FORMATS[format].extension}"
+    return expanded(folder) / folder_name(model) / format / f"{task}-{attempt}.{PLAN_FORMATS[format].extension}"
 
 
 @typed
@@ -162,7 +167,7 @@ def write_settings(folder: Path, settings: dict[str, Any]) -> None:
 
 def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:
     """Map each model to its recorded answers (texts or files) by (format, task, attempt); see :class:`FilePlanner`."""
-    path = Path(source)
+    path = expanded(source)
     if not path.exists():
         raise FileNotFoundError(f"source: no file or folder {str(path)!r}")
     answers = defaultdict[str, dict[_Place, str | Path]](dict)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ipaddress
+import json
+import math
 import os
 import re
+import ssl
 from collections.abc import Mapping
 from contextlib import closing, suppress
 from dataclasses import replace
@@ -12,30 +16,54 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from lw_torchrl._util.checks import counted, shown
-from lw_torchrl._util.files import parse_json
 from lw_torchrl.planners.answer_files import PlannerError, Reply, Tokens
 
 OPENAI = "https://api.openai.com/v1"
 REPLY_LIMIT = 4 * 2**20  # maximum size of a reply in bytes
 _KEY = "OPENAI_API_KEY"
-# Fallbacks for servers that reject a field, each with a pattern of the server's error message.
+_PROXIES = ("ALL_PROXY", "HTTP_PROXY", "HTTPS_PROXY")
+_VARIABLES = (*_PROXIES, "NO_PROXY", "SSL_CERT_FILE", "SSL_CERT_DIR")  # these change how a server is reached
+# Fallbacks for servers that reject a field, each with a pattern of the server's error message. "no system message"
+# prepends the system message to the user's message; chat templates without a system role report it in many ways.
 _FALLBACKS = {
     "max_completion_tokens": "max_completion_tokens",  # instead of max_tokens
     "json_object": "response_format|json_schema",  # as the type of response_format, instead of json_schema
-    "no system message": "system role|role.{0,20}system",  # prepend the system message to the user's message
+    "no system message": r"system.{0,3} (role|message|prompt|instruction)|role.{0,40}\bsystem\b|developer instruction"
+    r"|messages\W{1,3}0\W{1,3}role|user\W{1,3}(and|or|/)\W{0,3}assistant|roles must alternate",
+}
+_FALLBACK_NOTES = {
+    "json_object": "the schema was sent as json_object, since the server rejects json_schema",
+    "no system message": "the system message was sent as part of the user's message, since the server rejects it",
+}
+# Patterns of errors that a server reports with status 200 and without a numeric code, and the status each should have.
+_STATUSES = {
+    429: r"rate.?limit|too many requests|quota|overloaded|capacity",
+    401: r"api.?key|unauthori[sz]ed|authentication",
+    400: r"invalid.?request|context.{0,10}length|unsupported",
 }
 
 
 def server_address(base_url: str | None) -> str:
     """Check a server's address, and return the address without user name, password and query."""
+    name, given = "base_url", base_url
+    if not base_url and os.environ.get("OPENAI_BASE_URL"):
+        name, given = "the environment variable OPENAI_BASE_URL", os.environ["OPENAI_BASE_URL"]
     try:
-        url = urlsplit(base_url or os.environ.get("OPENAI_BASE_URL") or OPENAI)
+        url = urlsplit(given or OPENAI)
         valid = bool(url.hostname) and url.scheme in ("http", "https") and url.port != 0
     except ValueError:
         valid = False
     if not valid:
-        raise ValueError(f"base_url must be an address like 'http://127.0.0.1:8000/v1', got {shown(base_url)}")
+        raise ValueError(f"{name} must be an address like 'http://127.0.0.1:8000/v1', got {shown(given)}")
     return f"{url.scheme}://{url.netloc.rpartition('@')[2]}{url.path.rstrip('/')}"
+
+
+def _is_local(address: str) -> bool:
+    """Return whether an address is of this machine, which is reached without a proxy."""
+    host = urlsplit(address).hostname or ""
+    with suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost" or host.endswith(".localhost")
 
 
 class ChatClient:
@@ -52,15 +80,19 @@ class ChatClient:
         if self.address == OPENAI and not key:
             advice = f"set the environment variable {_KEY}, or pass the base_url of a server that needs no key"
             raise PlannerError(f"{model!r} at {self.address} needs a key: {advice}", fatal=True)
-        if not (key.isascii() and key.isprintable()):
-            raise PlannerError(f"the key in {_KEY} has invalid characters; set {_KEY} again", fatal=True)
+        for name in (_KEY, "OPENAI_ORG_ID", "OPENAI_PROJECT_ID"):  # these become headers of each request
+            value = os.environ.get(name, "").strip()
+            if not (value.isascii() and value.isprintable()):
+                raise PlannerError(f"the key in {name} has invalid characters; set {name} again", fatal=True)
         self._fallbacks = frozenset({"max_completion_tokens"} if self.address == OPENAI else ())
         options: Any = {"timeout": openai.Timeout(timeout, connect=min(timeout, 10.0))}
+        self._is_local = _is_local(self.address)
         try:
-            options |= {"http_client": _limited(openai, timeout)(**options), "max_retries": retries}
+            own = {"trust_env": False, "verify": ssl.create_default_context()} if self._is_local else {}
+            options |= {"http_client": _limited(openai, timeout)(**options, **own), "max_retries": retries}
             self._client = openai.OpenAI(api_key=key or "none", base_url=base_url, **options)
-        except (ValueError, ImportError, OSError) as error:
-            advice = "check the environment variables of proxies (ALL_PROXY) and certificates (SSL_CERT_FILE)"
+        except Exception as error:  # httpx and ssl raise many kinds of errors for invalid environment variables
+            advice = f"check the environment variables of proxies and certificates{self._environment()}"
             what = f"the HTTP client cannot be created ({_excerpt(str(error))})"
             raise PlannerError(f"{what}; {advice}", fatal=True) from None
 
@@ -77,9 +109,8 @@ class ChatClient:
         except self._openai.APIError as error:
             what, fatal = self._explain(error)
         else:
-            notes = list(reply.notes)
-            if request["schema"] and "json_object" in fallbacks:
-                notes.insert(0, "the schema was sent as json_object, since the server rejects json_schema")
+            active = [name for name in fallbacks if name != "json_object" or request["schema"]]
+            notes = [*(note for name, note in _FALLBACK_NOTES.items() if name in active), *reply.notes]
             if not (answering.startswith(self.model) or self.model.startswith(answering)):  # some servers append a date
                 notes.insert(0, f"the server reports that model {answering!r} answered instead of {self.model!r}")
             clean = {name: self._without_key(getattr(reply, name)) for name in ("text", "refusal")}
@@ -111,23 +142,38 @@ class ChatClient:
         elif status is None:
             reason = _excerpt(self._without_key(str(error.__cause__ or error))) or type(error.__cause__).__name__
             cause = f"the connection failed or was interrupted, {tried}: {reason}"
-            advice = "Check that the server is running and that base_url is correct"
+            advice = f"Check that the server is running and that base_url is correct{self._environment()}"
         elif status in (401, 403):
             cause = f"the server rejects the key in {_KEY}" if self._key else f"the server needs a key in {_KEY}"
             advice = "Set the key for this server"
-        elif status == 404:
+        elif status in (404, 405):
             cause, advice = "no such model or address", f"`GET {self.address}/models` lists the server's models"
+        elif status == 407:
+            cause, advice = "the proxy rejects the request", f"Check the proxy's user and password{self._environment()}"
         elif status == 429:
-            cause, advice = f"too many requests, {tried}", "Retry later or with a lower concurrency"
+            cause = f"too many requests, {tried}{_wait_text(error.response.headers)}"
+            advice = "Retry later or with a lower concurrency"
         elif status >= 500:
-            cause, advice, fatal = f"the server failed, {tried}", "Check the server's log, and retry", False
+            cause, fatal = f"the server failed, {tried}{_wait_text(error.response.headers)}", False
+            advice = f"Check the server's log, and retry{self._environment()}"
         elif re.search(r"context|too long|max_tokens|maximum.{0,20}length", message, re.IGNORECASE):
             cause, fatal = "the request exceeds the model's context", False
             advice = "Use fewer max_tokens, a shorter format (basic_py) or a longer context on the server"
+        elif status == 422:
+            cause, fatal = "the server rejects a field of the request as invalid", False
+            advice = "Change or remove the field that the server names"
         else:
             cause, fatal = "the server rejects the request", False
             advice = "Remove options that the server does not support"
         return f"{cause}{f' ({message})' if status else ''}. {advice}", fatal
+
+    def _environment(self) -> str:
+        """Name the environment variables that change how the server is reached; "" if none is set."""
+        names = [name for name in _VARIABLES if os.environ.get(name) or os.environ.get(name.lower())]
+        if self._is_local:
+            names = [name for name in names if name in _PROXIES]
+        ignored = ", ignored for a server on this machine" if self._is_local else ""
+        return f" (set in the environment: {', '.join(names)}{ignored})" if names else ""
 
     def _without_key(self, text: Any) -> Any:
         """Redact the API key in a text or in bytes. A key of under 8 characters may be an ordinary word, so is kept."""
@@ -163,14 +209,55 @@ def _limited(openai: Any, timeout: float) -> Any:
 
 
 def _status(status: int, content: bytes) -> int:
-    """Correct the HTTP status of a reply, from which the client decides whether to retry."""
-    if status == 500 and b"response_format" in content:  # llama-cpp-python rejects a type of schema
+    """Correct the HTTP status of a reply, from which the client decides whether to retry.
+
+    Some gateways report an error with status 200, and some servers report a rejected field with status 500.
+    """
+    if status not in (200, 500):
+        return status
+    body: Any = None
+    with suppress(ValueError, RecursionError):
+        body = json.loads(content)
+    if (error := _reported_error(body)) is None:
+        error = content.decode("utf-8", "replace") if status == 500 else None
+    if error is None:
+        return status
+    text = error if isinstance(error, str) else json.dumps(error)
+    if any(re.search(words, text[:20_000], re.IGNORECASE) for words in _FALLBACKS.values()):
         return 400
-    with suppress(ValueError):  # some gateways send status 200 with an error code in the body
-        if status == 200 and (error := parse_json(content).get("error")):
-            code = error.get("code") if isinstance(error, dict) else None
-            return code if type(code) is int and 400 <= code < 600 else 502
-    return status
+    codes = [error.get(name) for name in ("code", "status", "status_code")] if isinstance(error, dict) else []
+    for code in [*codes, body.get("code"), body.get("status")] if isinstance(body, dict) and status == 200 else ():
+        if re.fullmatch("[45][0-9][0-9]", str(code)):
+            return int(str(code))
+    found = (code for code, words in _STATUSES.items() if re.search(words, text[:20_000], re.IGNORECASE))
+    return next(found, 502) if status == 200 else status
+
+
+def _reported_error(body: Any) -> Any:
+    """Return the error that a reply's body reports, which is a text or a JSON value; None without an error."""
+    if not isinstance(body, dict):
+        return None
+    choices = body.get("choices")
+    first = choices[0] if isinstance(choices, list) and choices and isinstance(choices[0], dict) else {}
+    for part in (body, first, first.get("message")):
+        if isinstance(part, dict) and (error := part.get("error") or part.get("errors")):
+            return error
+    texts = () if first else ("message", "detail", "msg", "error_msg", "base_resp")  # the names that gateways use
+    return next((body[name] for name in texts if body.get(name)), None)
+
+
+def _wait_text(headers: Mapping[str, str]) -> str:
+    """Report for how long the server asks to wait, as an HTTP header states it; "" without such a header."""
+    for name, scale in (("retry-after-ms", 0.001), ("retry-after", 1.0)):
+        text = _excerpt(headers.get(name, ""))[:100]
+        try:
+            seconds = float(text) * scale
+        except ValueError:
+            if text:
+                return f"; the server asks to wait until {text}"
+        else:
+            return f"; the server asks to wait {seconds:g} s" if 1.0 <= seconds < math.inf else ""
+    return ""
 
 
 def _request_fields(model: str, request: Mapping[str, Any], fallbacks: frozenset[str]) -> dict[str, Any]:
@@ -205,27 +292,54 @@ def _read_completion(content: bytes) -> tuple[Reply, str]:
         size = f"the reply is larger than {REPLY_LIMIT // 2**20} MiB"
         raise PlannerError(f"{size}. Use fewer max_tokens, and remove options that lengthen replies")
     try:
-        body = parse_json(content)
-        choice = body["choices"][0]
-        message = choice["message"]
-        answer = message["content"]
-    except (ValueError, KeyError, IndexError, TypeError) as error:
-        if isinstance(error, ValueError) and content.strip()[:1] in (b"", b"{"):
+        body = json.loads(content.decode("utf-8-sig"))
+        choices = [choice for choice in body["choices"] or () if choice is not None]
+        if not choices:
+            raise PlannerError(f"the reply has no choices: {_excerpt(json.dumps(body))}. Retry, or change the prompt")
+        choice = choices[0]
+        message = choice.get("message") or {}
+        answer = message.get("content") or choice.get("text")
+    except (ValueError, RecursionError) as error:
+        if content.strip()[:1] in (b"", b"{"):
             raise PlannerError(f"the reply was cut off or is not JSON: {_excerpt(str(error))}. Retry") from None
-        advice = "Check that base_url is the address of an OpenAI-compatible server, usually ending in /v1"
-        text = _excerpt(content.decode("utf-8", "replace"))
-        raise PlannerError(f"the reply is not a chat completion: {text}. {advice}", fatal=True) from None
-    notes: tuple[str, ...] = ()
-    if isinstance(answer, list):  # the parts are thoughts and texts
-        answer = "".join(_text(part.get("text")) for part in answer if isinstance(part, dict))
-    elif not answer:
-        others = [name for name in ("reasoning_content", "reasoning", "tool_calls") if message.get(name)]
-        notes = tuple(f"the server sent {name} instead of an answer" for name in others)
+        raise _no_completion(content) from None
+    except (KeyError, TypeError, AttributeError):
+        raise _no_completion(content) from None
+    answer, refused = _join_parts(answer)
+    refusal = _text(message.get("refusal")) or refused
+    notes = []
+    if not answer.strip():
+        others = [name for name, value in message.items() if value and name not in ("role", "refusal")]
+        notes = [f"the server sent {_excerpt(name)[:40]} instead of an answer" for name in others if name != "content"]
+        if "content" in others:
+            notes.append(
+                f"the server sent content without a text instead of an answer: {_excerpt(str(message['content']))}"
+            )
     usage = body.get("usage")
     counts = [usage.get(name) if isinstance(usage, dict) else 0 for name in ("prompt_tokens", "completion_tokens")]
     tokens = Tokens(*(count if type(count) is int and count >= 0 else 0 for count in counts))
-    finish, refusal = _text(choice.get("finish_reason")), _text(message.get("refusal"))
-    return Reply(_text(answer), finish, refusal, tokens, notes), _excerpt(_text(body.get("model")))
+    finish = _text(choice.get("finish_reason"))
+    return Reply(answer, finish, refusal, tokens, tuple(notes)), _excerpt(_text(body.get("model")))
+
+
+def _no_completion(content: bytes) -> PlannerError:
+    advice = "Check that base_url is the address of an OpenAI-compatible server, usually ending in /v1"
+    text = _excerpt(content.decode("utf-8", "replace"))
+    return PlannerError(f"the reply is not a chat completion: {text}. {advice}", fatal=True)
+
+
+def _join_parts(content: Any) -> tuple[str, str]:
+    """Return the answer and the refusal in a message's content, which is a text or a list of parts; thoughts are
+    omitted."""
+    answer, refusal = [], []
+    for part in content if isinstance(content, list) else [content]:
+        if isinstance(part, dict) and part.get("type", "text") in ("text", "output_text", "refusal"):
+            text = part.get("text")
+            answer.append(_text(text.get("value") if isinstance(text, dict) else text))
+            refusal.append(_text(part.get("refusal")))
+        else:
+            answer.append(_text(part))
+    return "".join(answer), "".join(refusal)
 
 
 def _text(value: Any) -> str:

@@ -13,7 +13,7 @@ from threading import Event
 from typing import Any
 
 from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_choice, check_value, counted, shown, typed
-from lw_torchrl._util.files import AnyPath, read_json, write_json
+from lw_torchrl._util.files import AnyPath, expanded, read_json, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import AnyPlans, as_plans
@@ -210,7 +210,7 @@ class OpenAIPlanner:
             else:
                 answers.append(replace(self._read(reply, question, format), cached=True))
         if out is not None:
-            write_settings(Path(out) / folder_name(name), self.settings())
+            write_settings(expanded(out) / folder_name(name), self.settings())
             for answer in answers:
                 write_answer(out, name, answer)
         errors: list[PlannerError] = []
@@ -243,7 +243,8 @@ class OpenAIPlanner:
         """Return the cached reply to a request; None if the file is missing or corrupted."""
         with suppress(FileNotFoundError, ValueError, KeyError, TypeError):
             answer = read_json(self.cache_path(request), "the cached answer")["answer"]
-            return Reply(**{**answer, "tokens": Tokens(**answer["tokens"]), "notes": tuple(answer["notes"])})
+            reply = Reply(**{**answer, "tokens": Tokens(**answer["tokens"]), "notes": tuple(answer["notes"])})
+            return reply if reply.is_answer else None
         return None
 
     def _ask(self, questions: list[Question]) -> Generator[tuple[Question, Reply | PlannerError], None, None]:
@@ -261,7 +262,8 @@ class OpenAIPlanner:
                 if error.fatal:
                     stopped.set()
                 return question, error
-            write_json(self.cache_path(question.request), {"request": question.request, "answer": asdict(reply)})
+            if reply.is_answer:
+                write_json(self.cache_path(question.request), {"request": question.request, "answer": asdict(reply)})
             return question, reply
 
         with (

@@ -24,6 +24,7 @@ from torchrl.record.loggers import Logger
 
 from lw_torchrl._util.checks import Positive, check_choice, typed
 from lw_torchrl._util.files import AnyPath
+from lw_torchrl._util.text import markdown
 from lw_torchrl.evaluation.figures import plot_failures
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.language.layout import METAWORLD
@@ -198,9 +199,8 @@ class RerunLogger(Logger):
         stream = self._open()
         with self._lock:
             self._hparams.update(_flatten(cfg))
-            rows = [("key", "value"), ("---", "---"), *sorted(self._hparams.items())]
-            cells = [[text.replace("|", "\\|").replace("\n", " ") for text in row] for row in rows]
-            table = "\n".join(f"| {key} | {value} |" for key, value in cells)
+            rows = [f"| {markdown(key)} | {markdown(value)} |" for key, value in sorted(self._hparams.items())]
+            table = "\n".join(["| key | value |", "| --- | --- |", *rows])
             stream.log("hparams", rr.TextDocument(table, media_type=rr.MediaType.MARKDOWN), static=True)
             self._tabs.add_view("hparams")
             self._send()
@@ -244,9 +244,29 @@ class RerunLogger(Logger):
         self.flush(timeout)
         self._service_shutdown = True
         atexit.unregister(self.shutdown)
-        self.experiment.disconnect()
+        # With a full disk, Rerun may wait forever for its writing thread, which has ended, here and at exit.
+        closing = threading.Thread(target=self.experiment.disconnect, daemon=True)
+        closing.start()
+        closing.join(FLUSH_SECONDS if timeout is None else timeout)
+        if closing.is_alive():
+            rr.unregister_shutdown()
         if self.path is not None and not is_complete(self.path):
             warnings.warn(f"recording {str(self.path)!r} is incomplete: the end could not be written", stacklevel=2)
+
+    def is_written(self) -> bool:
+        """Return whether the closed file can be read and holds all pages; after a full disk, it does not."""
+        from rerun.chunk import RrdReader
+
+        if self.path is None or not is_complete(self.path):  # Rerun would wait for the rest of the file
+            return False
+        try:
+            reader = RrdReader(self.path)
+            for _ in reader.stream():  # a block that could not be written has a wrong checksum
+                pass
+            tabs = Tabs.read(reader)
+        except RuntimeError:
+            return False
+        return (0 if tabs is None else tabs.count) == self._tabs.count
 
     def _checkpoint_state(self) -> dict[str, Any]:
         return {"counters": dict(self._counters)}

@@ -6,8 +6,6 @@ import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,7 @@ from torch import Tensor
 
 from lw_torchrl._util.checks import missing_keys, typed
 from lw_torchrl._util.devices import device_of
-from lw_torchrl._util.files import AnyPath
+from lw_torchrl._util.files import AnyPath, replacing
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.diagnose.failure import Failure
@@ -35,7 +33,7 @@ from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.record.entities import STEP_TIME
 from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.recorded_episode import Ghost, RecordedEpisode
-from lw_torchrl.record.rerun_logger import RerunLogger, is_complete
+from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import Suite, known_suite, load_suite
 from lw_torchrl.transforms.qaf import QAFTransform
@@ -295,15 +293,12 @@ def run_recorded(
 @contextmanager
 def new_recording(path: AnyPath) -> Iterator[RerunLogger]:
     """Yield a logger whose file replaces ``path`` when the block ends; after an error, the old file is unchanged."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=target.parent, prefix=".") as folder:
-        file = Path(folder) / target.name
+    with replacing(path) as file:
         with RerunLogger(file) as logger:
             yield logger
-        if not is_complete(file):
-            raise OSError(f"recording {str(target)!r} could not be written completely; check whether the disk is full")
-        os.replace(file, target)
+        if not logger.is_written():
+            message = "could not be written completely; check whether the disk is full"
+            raise OSError(f"recording {os.fspath(path)!r} {message}")
 
 
 def write_recording(

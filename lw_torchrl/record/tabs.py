@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from lw_torchrl._util.checks import unknown_name
+from lw_torchrl._util.text import markdown
 from lw_torchrl.record.entities import EPISODE_TIMELINE, METRIC_TIMELINE, STEP_TIME, entity_path, rr, rrb
 from lw_torchrl.record.page import Page
 
@@ -84,6 +85,11 @@ class Tabs:
             entry = rr.AnyValues(entry=self._entries[number])
             stream.log(f"__properties/{_PROPERTY}/{number}", entry, static=True)
         self._saved = len(self._entries)
+
+    @property
+    def count(self) -> int:
+        """The number of entries."""
+        return len(self._entries)
 
     @property
     def has_grown(self) -> bool:
@@ -209,11 +215,11 @@ def overview(rows: Iterable[dict[str, Any]]) -> str:
         del columns["who"]
     if not causes:
         del columns["cause"]
-    by = [f"By {policies.pop()}.", ""] if len(policies) == 1 and None not in policies else []
+    by = [f"By {markdown(policies.pop())}.", ""] if len(policies) == 1 and None not in policies else []
     lines = [f"#### {' · '.join(counts)}", "", *by, f"| {' | '.join(columns)} |", "|-" * len(columns) + "|"]
     for row in rows:
         mark = {"success": "✓", "failed": "✗"}.get(row["ended"], "·")
         texts = row | {"mark": mark, "when": f"t = {row['at']} ({row['seconds']:.2f} s)"}
-        cells = [str(texts[key] or "").replace("|", "/") for key in columns.values()]
+        cells = [markdown(texts[key] or "") for key in columns.values()]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lw_torchrl._util.text import markdown
 from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure
 from lw_torchrl.evaluation.diagnose.sentences import replaced_text
 from lw_torchrl.language.layout import Layout
-from lw_torchrl.language.plans import one_line
 from lw_torchrl.record.entities import FALSE, STEEL, Color, changes, rr, step_color
 from lw_torchrl.record.recorded_episode import NO_STEP, Ghost, RecordedEpisode
 
@@ -124,14 +124,16 @@ def verdict(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None = No
     if ghost is not None:
         end, parting = ghost.episode.first_success, ghost.parts_at(episode)
         ended = "does not succeed" if end is None else f"succeeds at {episode.at(end)}"
-        lines.insert(1, f"**The blue ghost**, with {ghost.by}, {ended}; the two diverge at **t = {parting}**.")
+        lines.insert(
+            1, f"**The blue ghost**, with {markdown(ghost.by)}, {ended}; the two diverge at **t = {parting}**."
+        )
     # Use single line breaks, because paragraphs would not fit into a small window.
     head = f"**{lines[0]}**  \n" if small else f"#### {lines[0]}\n\n"
-    return head + "  \n".join([*lines[1:], " · ".join(heading.parts())]) + "\n"
+    return head + "  \n".join([*lines[1:], " · ".join(map(markdown, heading.parts()))]) + "\n"
 
 
 def _reasons(failure: Failure, episode: RecordedEpisode) -> list[str]:
-    lines = [failure.why] if failure.why else []
+    lines = [markdown(failure.why)] if failure.why else []
     if failure.also is not None:
         lines.append(f"Also: {failure.also}, {CAUSES[failure.also]}.")
     seen = f"Seen at {episode.at(failure.at)} of {len(episode)}"
@@ -165,12 +167,14 @@ def _observations(episode: RecordedEpisode) -> list[str]:
     answers = episode.answers
     never = [] if answers is None else [i for i in range(len(episode.steps)) if not answers[:, i].any()]
     if never:
-        lines.append("Never true: " + "; ".join(f"condition {i + 1}, “{episode.steps[i][0]}”" for i in never) + ".")
+        lines.append(
+            "Never true: " + "; ".join(f"condition {i + 1}, “{markdown(episode.steps[i][0])}”" for i in never) + "."
+        )
     return lines
 
 
 def _step(episode: RecordedEpisode, step: int) -> str:
-    return f"plan step {step + 1}, **“{episode.steps[step][1]}”**"
+    return f"plan step {step + 1}, **“{markdown(episode.steps[step][1])}”**"
 
 
 def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
@@ -193,14 +197,18 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
             parts.append(f"**{'No condition holds' if none else 'No step stands out'}: all steps mixed**")
         for step, (_, skill) in enumerate(episode.steps):
             truth = None if episode.qaf is None else bool(episode.qaf[row, step])
-            line = f"{MARKS[truth]}  {step + 1}.  if {conditions[step]}"
+            line = f"{MARKS[truth]}  {step + 1}.  if {markdown(conditions[step])}"
             if episode.believed is not None and (believed := bool(episode.believed[row, step])) != truth:
                 line += f"  (evaluator: {MARKS[believed]})"
             if active[row] == step:
-                reason = one_line(episode.reasons[step]) if episode.reasons else ""
-                parts += [f"**{line}**", f"\u2003\u2003**→ {skill}**", *([f"\u2003*{reason}*"] if reason else [])]
+                reason = markdown(episode.reasons[step]) if episode.reasons else ""
+                parts += [
+                    f"**{line}**",
+                    f"\u2003\u2003**→ {markdown(skill)}**",
+                    *([f"\u2003*{reason}*"] if reason else []),
+                ]
             else:
-                parts += [line, f"\u2003\u2003{skill}"]
+                parts += [line, f"\u2003\u2003{markdown(skill)}"]
         texts.append("  \n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
     stream.send_columns(f"{root}/plan", episode.times(rows), documents)

@@ -84,25 +84,26 @@ def open_viewer(
         layouts: list[Path] = []
         openings: dict[str, Opening] = {}
         unknown: list[ValueError] = []
-        for recording in recordings:
+        for number, recording in enumerate(recordings):
             files.append(stack.enter_context(readable(recording)))
-            reader = RrdReader(files[-1])
-            known, tabs, front, at = reader.recordings()[0], Tabs.read(reader), episode, step
-            if tabs is not None and episode is not None:
-                try:
-                    tabs.index(episode)
-                except ValueError as error:
-                    unknown.append(error)
-                    front = at = None
-            openings[known.recording_id] = Opening.of(tabs, front, at)
-            own_front = None if web_port is None else front  # only a blueprint can set a web viewer's front tab
-            if own_front is not None:  # write a copy without the recording's blueprint, which would take precedence
-                files[-1] = folder / f"{known.recording_id}.rrd"
-                ids = {"application_id": known.application_id, "recording_id": known.recording_id}
-                reader.stream().write_rrd(files[-1], **ids)
-            if tabs is not None and (own_front is not None or not reader.blueprints()):  # it was never closed
-                layouts.append(folder / f"{known.recording_id}.rbl")
-                tabs.blueprint(own_front).save(known.application_id, str(layouts[-1]))
+            with damaged(recording):
+                reader = RrdReader(files[-1])
+                known, tabs, front, at = reader.recordings()[0], Tabs.read(reader), episode, step
+                if tabs is not None and episode is not None:
+                    try:
+                        tabs.index(episode)
+                    except ValueError as error:
+                        unknown.append(error)
+                        front = at = None
+                openings[known.recording_id] = Opening.of(tabs, front, at)
+                own_front = None if web_port is None else front  # only a blueprint can set a web viewer's front tab
+                if own_front is not None:  # write a copy without the recording's blueprint, which would take precedence
+                    files[-1] = folder / f"{number}.rrd"
+                    ids = {"application_id": known.application_id, "recording_id": known.recording_id}
+                    reader.stream().write_rrd(files[-1], **ids)
+                if tabs is not None and (own_front is not None or not reader.blueprints()):  # it was never closed
+                    layouts.append(folder / f"{number}.rbl")
+                    tabs.blueprint(own_front).save(known.application_id, str(layouts[-1]))
         if len(unknown) == len(files):
             raise unknown[-1]
         port = str(free_port())
@@ -144,6 +145,17 @@ def find_recordings(path: AnyPath) -> list[Path]:
     if not recordings:
         raise FileNotFoundError(f"folder {str(recording)!r} holds no recording (*.rrd)")
     return sorted(recordings, key=lambda file: (file.stat().st_mtime, file.name))
+
+
+@contextmanager
+def damaged(recording: Path) -> Iterator[None]:
+    """Convert any error of reading a recording to a :class:`ValueError`, also Rerun's panics."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit, MemoryError, OSError):
+        raise
+    except BaseException as error:
+        raise ValueError(f"recording {str(recording)!r} is damaged ({type(error).__name__}: {error})") from error
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from lw_torchrl._util.checks import differences, typed
-from lw_torchrl._util.files import AnyPath, absent_policy, locked, shipped_policy
+from lw_torchrl._util.files import AnyPath, absent_policy, companion, expanded, locked, shipped_policy
 from lw_torchrl._util.reproducibility import LIBRARIES, warn_of_other_versions
 from lw_torchrl._util.tensor_files import pop_state, read_tensors, write_tensors
 from lw_torchrl.language.plans import AnyPlans, PlanError, as_plans
@@ -248,7 +248,7 @@ def demonstrated_tasks(path: AnyPath) -> set[str]:
 
 def training_file(checkpoint: Path) -> Path:
     """Return the path of the training state stored next to a policy, for example ``mt10.training.safetensors``."""
-    return checkpoint.with_name(f"{checkpoint.stem}.training{checkpoint.suffix}")
+    return companion(checkpoint, f".training{checkpoint.suffix}", stem=checkpoint.stem)
 
 
 def check_description(path: Path, expected: Mapping[str, Any], stored: Mapping[str, Any] | None = None) -> None:
@@ -276,7 +276,7 @@ class CheckpointFiles:
     """
 
     def __init__(self, checkpoint: AnyPath, part: str | None) -> None:
-        self.checkpoint, self.part = Path(checkpoint), part
+        self.checkpoint, self.part = expanded(checkpoint), part
         self.state = training_file(self.checkpoint) if part else self.checkpoint
         self._known: tuple[int, ...] | None = None  # identifies the last version of the training state read or written
 

@@ -152,7 +152,8 @@ class SwapUnmentioned(PlanAugmentation):
         number, device = kept.shape[0], kept.device
         swaps, rows = [], []
         for item in range(kept.shape[-1]):
-            swaps.append(~kept[:, item] & (torch.rand(number, device=device) < self.probability))
+            drawn = torch.rand(number, device=device, dtype=torch.float32)
+            swaps.append(~kept[:, item] & (drawn < self.probability))
             rows.append(torch.randint(number, (number,), device=device))
         owner = self.table("owner", device)
         swap = torch.stack([*swaps, torch.zeros_like(swaps[0])], -1).index_select(-1, owner)  # (n, D)
@@ -197,7 +198,7 @@ class HideOpening(Augmentation):
             return tensordict  # there is no row to take the opening from
         opening = observation[..., self._opening]
         others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
-        hidden = torch.rand(opening.shape, device=opening.device) < self.probability
+        hidden = torch.rand(opening.shape, device=opening.device, dtype=torch.float32) < self.probability
         observation[..., self._opening] = torch.where(hidden, others, opening)
         return tensordict.copy().set(self.in_keys[0], observation)
 
@@ -240,12 +241,12 @@ class JitterTarget(PlanAugmentation):
         plans = self._read_plans(plans)
         pushes = role_table(plans, self._tables, lambda role: role.verb in ("push", "pull"))
         self.register_buffer("pushes", pushes, persistent=False)  # (T, S) bool
-        self.register_buffer("scale", std * torch.tensor([0.5, 0.5, 1.0]), persistent=False)
+        self.register_buffer("scale", std * torch.tensor([0.5, 0.5, 1.0], dtype=torch.float32), persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         active, rows = self.active(tensordict, self.in_keys[::-1])
         pushed = (active & self.table("pushes", rows.device)[rows]).any(-1, keepdim=True)
-        offset = self.table("scale", rows.device) * torch.randn(*rows.shape, 3, device=rows.device)
+        offset = self.table("scale", rows.device) * torch.randn(*rows.shape, 3, device=rows.device, dtype=torch.float32)
         return tensordict.copy().set(self.out_keys[0], torch.where(pushed, offset, 0.0))
 
 

@@ -271,7 +271,7 @@ class _Draws:
         self._plans = [plans[task] for task in tables.index.tasks]
         self._width = plans.num_steps
         self._which = torch.empty(0, 3, dtype=torch.int64)  # the table row, episode and block of each row
-        self._numbers = torch.empty(0, _BLOCK, self._width)
+        self._numbers = torch.empty(0, _BLOCK, self._width, dtype=torch.float32)
 
     def __call__(self, rows: Tensor, episode: Tensor, step: Tensor) -> Tensor:
         """Return numbers (B, S) float64 in [0, 1] for table rows, episodes and time steps (each B int64)."""

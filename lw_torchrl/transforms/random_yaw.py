@@ -67,7 +67,7 @@ def random_rotations(number: int, device: torch.device | None = None) -> Tensor:
 
     Source: K. Shoemake, "Uniform random rotations", from unit quaternions.
     """
-    w, x, y, z = nn.functional.normalize(torch.randn(number, 4, device=device), dim=-1).unbind(-1)
+    w, x, y, z = nn.functional.normalize(torch.randn(number, 4, device=device, dtype=torch.float32), dim=-1).unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
         (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
@@ -150,7 +150,7 @@ class RandomYaw(PlanAugmentation):
         self._begin = self.layout.displaced("RandomYaw").start
 
     def _angle(self, tensordict: TensorDictBase, observation: Tensor) -> Tensor:
-        angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
+        angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device, dtype=torch.float32)
         if not self.has_plans:
             return angle
         any_angle = torch.pi * (2 * torch.rand_like(angle) - 1)
@@ -165,9 +165,9 @@ class RandomYaw(PlanAugmentation):
     def _tilt(self, tensordict: TensorDictBase) -> Tensor:
         """Draw the 3-D rotation of each row, (B, 3, 3) float32."""
         free = self._all_true(tensordict, "to_places")
-        chosen = free & (torch.rand(free.shape, device=free.device) < self.tilt)
+        chosen = free & (torch.rand(free.shape, device=free.device, dtype=torch.float32) < self.tilt)
         rotations = random_rotations(free.numel(), free.device).reshape(*free.shape, 3, 3)
-        return torch.where(chosen[..., None, None], rotations, torch.eye(3, device=free.device))
+        return torch.where(chosen[..., None, None], rotations, torch.eye(3, device=free.device, dtype=torch.float32))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = tensordict.copy()  # replay[:] may return the storage itself

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -193,11 +194,19 @@ def test_a_missing_package_is_an_error_with_its_extra(made, monkeypatch, tmp_pat
 
 def test_a_full_disk_is_an_error_before_minari_writes(made, monkeypatch, tmp_path):
     pytest.importorskip("minari")
-    usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
+    out = lw.export_dataset(made.root, "minari", tmp_path / "whole")
+    reserved = []
+
+    def posix_fallocate(handle, start, size):
+        reserved.append(size)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", posix_fallocate)
     with pytest.raises(OSError, match="No space left"):
         lw.export_dataset(made.root, "minari", tmp_path / "out")
-    assert [*tmp_path.iterdir()] == []
+    assert [*tmp_path.iterdir()] == [out]
+    written = (out / "data" / "main_data.hdf5").stat().st_size
+    assert written < reserved[0]
 
 
 LEROBOT = os.environ.get(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import pickle
 
 import pytest
@@ -10,7 +11,17 @@ from collecting import Evil, collect, tree
 from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import RandomSampler, SamplerWithoutReplacement, SliceSampler
-from torchrl.envs.transforms import Compose, MultiStepTransform, ObservationNorm, Reward2GoTransform, RewardScaling
+from torchrl.envs.transforms import (
+    BatchSizeTransform,
+    CatFrames,
+    Compose,
+    MultiStepTransform,
+    ObservationNorm,
+    RandomCropTensorDict,
+    Reward2GoTransform,
+    RewardScaling,
+    RewardSum,
+)
 
 import lw_torchrl as lw
 from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
@@ -134,6 +145,40 @@ def test_transforms_of_written_rows_are_errors(dataset, make):
     for transform in (make(), Compose(RewardScaling(0.0, 1.0), Compose(make()))):
         with pytest.raises(ValueError, match=f"transform: {type(make()).__name__}"):
             LanguageWorldExperienceReplay(dataset.root, label="executed", transform=transform)
+
+
+SLICES = functools.partial(SliceSampler, slice_len=4, traj_key=("collector", "traj_ids"))
+FRAMES = functools.partial(CatFrames, 3, -1, in_keys=["observation"], out_keys=["frames"])
+RESHAPE = functools.partial(BatchSizeTransform, reshape_fn=lambda rows: rows.reshape(-1, 4).refine_names(None, "time"))
+
+
+@pytest.mark.parametrize("sampler", [None, RandomSampler, lw.TaskBalancedSampler, SamplerWithoutReplacement, SLICES])
+@pytest.mark.parametrize("make", [FRAMES, RewardSum, lambda: RandomCropTensorDict(2)], ids=range(3))
+def test_transforms_over_time_need_slices(dataset, make, sampler):
+    open_buffer = functools.partial(LanguageWorldExperienceReplay, dataset.root, label="executed", batch_size=8)
+    message = f"transform: {type(make()).__name__} reads consecutive .*; use sampler=SliceSampler.*BatchSizeTransform"
+    with pytest.raises(ValueError, match=message):
+        open_buffer(sampler=sampler, transform=Compose(RewardScaling(0.0, 1.0), make()))
+    replay = open_buffer(sampler=sampler)
+    for add in (replay.append_transform, functools.partial(replay.insert_transform, 0)):
+        with pytest.raises(ValueError, match=message):
+            add(make())
+    replay.sample()
+    sliced = open_buffer(sampler=SLICES(), transform=Compose(RESHAPE(), make()))
+    if sampler not in (None, SLICES):
+        with pytest.raises(ValueError, match=message):
+            sliced.set_sampler(sampler())
+
+
+def test_frames_of_slices_are_of_one_episode(dataset):
+    rows = LanguageWorldExperienceReplay(dataset.root, label="executed")[:]
+    transform = Compose(RESHAPE(), FRAMES(), BatchSizeTransform(reshape_fn=lambda rows: rows.reshape(-1)))
+    options = dict(label="executed", batch_size=32, sampler=SLICES(), transform=transform)
+    batch = LanguageWorldExperienceReplay(dataset.root, **options).sample()
+    for frames, episode in zip(batch["frames"].unflatten(-1, (3, -1)), batch["collector", "traj_ids"], strict=True):
+        for frame in frames:
+            own = (rows["observation"] == frame).all(-1)
+            assert episode in rows["collector", "traj_ids"][own]
 
 
 def test_an_inverse_transform_changes_samples(dataset):

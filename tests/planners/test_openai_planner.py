@@ -99,7 +99,8 @@ FAILURES = {
     "cut JSON": (Failure(200, '{"choices": ['), "cut off or is not JSON"),
     "HTML": (Failure(200, "<style>a{}</style><body>Welcome</body>"), "not a chat completion: Welcome"),
     "other JSON": (Failure(200, {"hello": 1}), "not a chat completion"),
-    "no choices": (Failure(200, {"choices": []}), "not a chat completion"),
+    "no choices": (Failure(200, {"choices": []}), "has no choices"),
+    "null choices": (Failure(200, {"choices": None, "created": 1}), "has no choices"),
     "a slow reply": (Failure(200, completion("x"), drip=1.0), "answer within 0.4 s, tried 2 times"),
     "a dripping reply": (Failure(200, completion("x"), drip=0.1), "answer within 0.4 s, tried 1 time"),
     "a large reply": (Failure(200, completion("x" * REPLY_LIMIT)), "larger than 4 MiB"),
@@ -150,10 +151,6 @@ def test_a_refused_connection(tmp_path, monkeypatch):
         with pytest.raises(PlannerError, match=f"'m' at {address}, push, attempt 0: the connection failed") as caught:
             planner.plans("push", progress=False)
         assert caught.value.fatal
-        monkeypatch.setenv("ALL_PROXY", "socks://127.0.0.1:1")
-        monkeypatch.delenv("NO_PROXY")
-        with pytest.raises(PlannerError, match=r"socks.*check the environment variables .*ALL_PROXY"):
-            planner.plans("push", progress=False)
     assert not list(tmp_path.iterdir())
 
 
@@ -233,7 +230,10 @@ def test_answers_without_a_plan(ask, tmp_path, body, note):
     assert answer.decoded.reason
     assert note is None or any(note in other for other in answer.notes)
     (again,) = ask(FakeServer(), "push")
-    assert (again.cached, again.text, again.notes) == (True, answer.text, answer.notes)
+    if answer.text or any("refused" in note for note in answer.notes):
+        assert (again.cached, again.text, again.notes) == (True, answer.text, answer.notes)
+    else:  # an empty reply is not an answer, so the model is asked again
+        assert again.decoded.plan == PLANS["push"]
     (read,) = lw.planners.FilePlanner(tmp_path / "out").plans("push")
     assert read.text == answer.text
 

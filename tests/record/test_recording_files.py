@@ -65,6 +65,41 @@ def test_a_new_recording_replaces_a_file_only_when_it_is_complete(tmp_path):
     assert os.listdir(tmp_path) == ["a.rrd"]
 
 
+FILLED = """
+import resource
+from lw_torchrl.record.rollouts import new_recording
+from recordings import make_rollout
+
+with new_recording(sys.argv[1]) as logger:
+    logger.log_episode(make_rollout(400), task="push", objects={})
+    logger.flush()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), resource.RLIM_INFINITY))
+    logger.log_episode(make_rollout(400), task="reach", objects={})
+"""
+
+
+def test_a_full_disk_keeps_the_old_recording(tmp_path):
+    path = tmp_path / "a.rrd"
+    assert run_script(FILLED, path, 2**30).wait(120) == 0
+    whole = path.read_bytes()
+    for size in (len(whole) // 2, len(whole) - 10_000):  # Rerun may wait forever, but not always
+        assert run_script(FILLED, path, size).wait(120) == 1
+        assert path.read_bytes() == whole
+        assert os.listdir(tmp_path) == ["a.rrd"]
+
+
+def test_a_block_that_could_not_be_written_is_noticed(tmp_path):
+    with RerunLogger(tmp_path / "a.rrd") as logger:
+        logger.log_episode(make_rollout(400), task="push", objects={})
+    assert logger.is_written()
+    content = bytearray((tmp_path / "a.rrd").read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 4096] = bytes(4096)  # a disk that was full for a while
+    (tmp_path / "a.rrd").write_bytes(content)
+    assert is_complete(tmp_path / "a.rrd")
+    assert not logger.is_written()
+
+
 def test_an_exception_closes_the_recording(tmp_path):
     with suppress(KeyError), RerunLogger(tmp_path / "a.rrd") as logger:
         logger.log_episode(make_rollout(), task="push", objects={})

@@ -8,11 +8,9 @@ data/metadata.json     Minari's description, and the metadata of the lw_torchrl 
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
-import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -43,9 +41,7 @@ def _infos(table: Table, start: int, end: int) -> dict[str, Array]:
 
 def write(table: Table, folder: Path, bar: Progress) -> None:
     """Write a table as a Minari dataset, whose id is the folder's name, with the suffix -v0 if it has no version."""
-    if shutil.disk_usage(folder).free < 2 * sum(column.nbytes for column in table.columns.values()):
-        # Check in advance: a write that fails inside HDF5 leaves the file open, and the process crashes at exit.
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+    import h5py
     import minari
     from gymnasium.spaces import Box
     from minari.data_collector import EpisodeBuffer
@@ -58,6 +54,10 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
         action_space=Box(-1.0, 1.0, action.shape[1:], np.float32),
         data_format="hdf5",
     )
+
+    (file,) = (folder / "data").glob("*.hdf5")
+    h5py.File(file, "w", track_order=True).close()
+    _reserve(file, 2 * sum(column.nbytes for column in table.columns.values()) + 100_000 * len(table.tasks))
 
     def episodes() -> Iterator[Any]:
         for start, end in table.spans():
@@ -73,15 +73,26 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
             bar.update(end - start)
 
     storage.update_episodes(episodes())
+    _reserve(file, 100_000 * len(table.tasks))
     storage.update_episode_metadata(
         {"task": task, "task_description": table.descriptions[task], "plan": table.plans.get(task, "")}
         for task in table.tasks
     )
-    name = re.sub(r"[^-\w]", "-", re.sub(r"^\.|\.[0-9a-f]{16}\.tmp$", "", folder.name))
+    name = re.sub(r"[^-\w]", "-", folder.name)
     about = "Robot demonstrations; the metadata of each episode hold the task's description and plan."
     versioned = name if re.search(r"-v\d+$", name) else f"{name}-v0"
     metadata = {"dataset_id": versioned, "minari_version": minari.__version__, "description": about}
     storage.update_metadata({**metadata, ABOUT: json.dumps(table.metadata)})
+
+
+def _reserve(file: Path, size: int) -> None:
+    """Reserve ``size`` bytes on the disk after the end of an HDF5 file, which shrinks again when HDF5 closes the file.
+
+    A write that fails inside HDF5, because the disk is full, leaves the file open, and the process crashes at exit.
+    """
+    if hasattr(os, "posix_fallocate"):  # not on macOS
+        with file.open("r+b") as handle:
+            os.posix_fallocate(handle.fileno(), 0, file.stat().st_size + size)
 
 
 def _flat(name: str, value: Any) -> dict[str, Array]:

@@ -1,0 +1,47 @@
+"""Show text that others wrote, such as plans and answers, on a terminal or in Markdown, without effects of its own."""
+
+from __future__ import annotations
+
+import re
+from typing import IO, Any
+
+# Characters that control a terminal, or that change the order of other characters, without "\n" and "\t".
+_CONTROL = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb\ud800-\udfff"
+    "\U000e0000-\U000e007f]"
+)
+# Characters of links, images, HTML, code, emphasis, tables and mathematics, and the signs of links without brackets.
+_MARKUP = re.compile(r"[\\`*\[\]<>&|~$#]|(?<=[A-Za-z]):(?=//)|(?<=\b[Ww][Ww][Ww])\.|(?<=\w)@|:(?=\w+@)")
+
+
+def printable(text: str) -> str:
+    r"""Replace control characters, such as a terminal's escape sequences, by Python's notation, such as ``\x1b``.
+
+    Example:
+        >>> print(printable("plan\x1b[2J"))
+        plan\x1b[2J
+    """
+    return _CONTROL.sub(lambda match: match[0].encode("unicode_escape", "surrogatepass").decode(), text)
+
+
+def markdown(text: object) -> str:
+    r"""Convert a text to one line of Markdown that renders as the same text: no links, images, HTML or emphasis.
+
+    Example:
+        >>> print(markdown("![x](http://a.b/c)"))
+        !\[x\](http\://a.b/c)
+    """
+    return _MARKUP.sub(r"\\\g<0>", printable(" ".join(str(text).split())))
+
+
+class PrintableStream:
+    """A text stream that writes :func:`printable` text to another stream."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        return self._stream.write(printable(text))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
