@@ -101,16 +101,19 @@ def test_actions_beyond_one_are_clipped(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"action": None}, "requires a column 'action' with 4 numbers"),
+        ({"action": None}, "column 'action' needs 4 numbers"),
         (
             {"observation.environment_state": None},
-            r"requires a column 'observation' .* observation.state \(4\)",
+            r"column 'observation' needs 39 .* observation.state \(4\)",
         ),
         ({"action": [[0.0] * 4] * 8 + [[float("nan")] * 4]}, "action holds NaN"),
-        ({"action": [[0.0] * 4] * 8 + [None]}, "action must have the same number of values"),
-        ({"action": [[0.0] * 4] * 8 + [[0.0] * 3]}, "action must have the same number of values"),
+        ({"action": [[0.0] * 4] * 8 + [None]}, r"column 'action' needs .* action \(different sizes\)"),
+        ({"action": [[0.0] * 4] * 8 + [[0.0] * 3]}, r"column 'action' needs .* action \(different sizes\)"),
+        ({"action": [[0.0] * 4] * 7 + [[0.0] * 3, [0.0] * 5]}, "action must have the same number of values"),
         ({"next.success": [0.0] * 8 + [0.3]}, "next.success must hold booleans"),
-        ({"task_index": [0, 0, 0, 1, 1, 1, 2, 2, 2]}, "task_index must be the same"),
+        ({"episode_index": [0.0] * 8 + [float("nan")]}, "episode_index must hold whole numbers, but holds nan"),
+        ({"frame_index": [0, 1, 2, 3, 0, 1, 0, 1, None]}, "frame_index must hold whole numbers, but holds nan"),
+        ({"frame_index": [0, 1, 1, 3, 0, 1, 0, 1, 2]}, "frame_index must differ"),
     ],
 )
 def test_unsuitable_columns_are_errors(tmp_path, changed, message):
@@ -181,7 +184,7 @@ def test_other_hdf5_is_an_error_with_the_path(tmp_path):
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "flat.hdf5", "w") as file:
         file["observations"] = STATES
-    with pytest.raises(ExchangeError, match=r"flat\.hdf5 has no group"):
+    with pytest.raises(ExchangeError, match=r"flat\.hdf5.*no group with actions"):
         lw.import_dataset(tmp_path / "flat.hdf5", tmp_path / "out")
     (tmp_path / "broken.hdf5").write_bytes(b"no rows at all")
     with pytest.raises(ExchangeError, match=r"broken\.hdf5'"):
