@@ -31,7 +31,7 @@ from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.suites.suite import Suite
 
-_SECONDS, _BYTES_PER_SECOND = 60, 1e6  # time limit of the child process: a constant, and a part for the files' size
+_SECONDS, _BYTES_PER_SECOND = 30, 1e6  # time limit of the child process: a constant, and a part for the files' size
 
 
 class ExchangeError(DatasetError):

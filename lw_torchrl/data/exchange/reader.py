@@ -188,7 +188,7 @@ def read_parquet(source: Path, files: Files) -> None:
     parts: dict[str, list[Array]] = {name: [] for name in (*chosen, *index, *texts)}
     words: dict[str, list[str]] = {name: [] for name in texts}
     for path, (_, columns) in zip(paths, leaves, strict=True):
-        with pq.ParquetFile(path, pre_buffer=False) as file:
+        with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
             table = file.read(columns=[columns[name][0] for name in parts], use_threads=False)
         while any(str(field.type).startswith("struct") for field in table.schema):
             table = table.flatten()
@@ -326,7 +326,7 @@ def _records(path: Path, names: Sequence[str], files: Files | None = None) -> li
     if path.suffix == ".jsonl":
         records = [json.loads(line) for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
         return [record for record in records if isinstance(record, dict)]
-    with pq.ParquetFile(path, pre_buffer=False) as file:
+    with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
         leaves = {name: leaf for name, leaf in _leaves(file.metadata)[1].items() if name in names}
         if files is not None:
             files.reserve(path.name, 8 * sum(number for _, number in leaves.values()))
