@@ -202,7 +202,7 @@ def _finite(text: str) -> float:
 
 
 def check_damage(error: Exception) -> None:
-    """Raise ``error`` again if it shows a limit of the system, such as too many open files, and not a corrupted file."""
+    """Raise ``error`` again if it shows a limit of the system, such as too many open files, and not damage."""
     expected = (None, errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EINVAL)
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno not in expected):
         raise error

@@ -251,7 +251,7 @@ def test_two_dimensional_columns_and_other_dtypes_are_read(tmp_path):
 @pytest.mark.parametrize("mapping", [{4: "push"}, {"4": "push-v3"}, {"push": 4}])
 def test_numbers_of_tasks_are_mapped(tmp_path, mapping):
     source = flat(tmp_path / "a.parquet", task=None, task_index=[4] * 6)
-    with pytest.raises(ValueError, match="task must be one of .* got '4'.*map it"):
+    with pytest.raises(ValueError, match=r"task must be one of .* got '4'.*map it"):
         lw.import_dataset(source, tmp_path / "out")
     assert imported(source, tmp_path / "out", "lacks", task=mapping).config.tasks == ("push",)
 

@@ -175,7 +175,7 @@ def read_parquet(source: Path, files: Files) -> None:
     values = {name: sum(columns[name][1] for _, columns in leaves) for name in sorted(everywhere)}
     chosen = {}
     for column, width in files.widths.items():
-        fits = {name: all(columns[name][1] == of * width for of, columns in leaves) for name in values}
+        fits = {name: all(columns[name][1:] == (of * width, True) for of, columns in leaves) for name in values}
         if name := files.choose(column, fits):
             chosen[name] = column
     seen = {name: values[name] / rows for name in values}
@@ -193,21 +193,34 @@ def read_parquet(source: Path, files: Files) -> None:
         while any(str(field.type).startswith("struct") for field in table.schema):
             table = table.flatten()
         read = dict(zip(reversed(table.column_names), reversed(table.columns), strict=True))
-        for name in parts:
+        for name in [*parts]:
             column = read[name].combine_chunks()
-            parts[name].append(_codes(column, words[name]) if name in words else _numbers(name, column))
+            try:
+                parts[name].append(_codes(column, words[name]) if name in words else _numbers(name, column))
+            except Refused:
+                if chosen.get(name, "action") in ("action", "observation"):
+                    raise
+                files.unfit[chosen.pop(name)] = name  # a column that can be missing
+                del parts[name]
     read = {name: np.concatenate(arrays) for name, arrays in parts.items()}
     _arrange(source, info, files, {name: read.pop(name) for name in index}, read, words, chosen, paths, of_file)
 
 
-def _leaves(metadata: Any) -> tuple[int, dict[str, tuple[str, int]]]:
-    """Return the number of rows of a parquet file, and each leaf column's path and number of values by its name."""
-    leaves: dict[str, tuple[str, int]] = {}
+def _leaves(metadata: Any) -> tuple[int, dict[str, tuple[str, int, bool]]]:
+    """Return the number of rows of a parquet file, and by name the path of each leaf column, its number of values, and
+    whether the values are numbers."""
+    leaves: dict[str, tuple[str, int, bool]] = {}
     for place in range(metadata.num_columns):
         groups = [metadata.row_group(group).column(place) for group in range(metadata.num_row_groups)]
-        path = metadata.schema.column(place).path
-        leaves.setdefault(_leaf(path), (path, sum(group.num_values for group in groups)))
+        column = metadata.schema.column(place)
+        path = column.path
+        leaves.setdefault(_leaf(path), (path, sum(group.num_values for group in groups), _is_number(column)))
     return metadata.num_rows, leaves
+
+
+def _is_number(column: Any) -> bool:
+    kind = column.logical_type.type
+    return kind == "FLOAT16" or (kind in ("NONE", "INT") and "BYTE" not in column.physical_type)
 
 
 def _numbers(name: str, column: Any) -> Array:
@@ -329,8 +342,8 @@ def _records(path: Path, names: Sequence[str], files: Files | None = None) -> li
     with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
         leaves = {name: leaf for name, leaf in _leaves(file.metadata)[1].items() if name in names}
         if files is not None:
-            files.reserve(path.name, 8 * sum(number for _, number in leaves.values()))
-        rows: list[dict[str, Any]] = file.read(columns=[leaf for leaf, _ in leaves.values()]).to_pylist()
+            files.reserve(path.name, 8 * sum(number for _, number, _ in leaves.values()))
+        rows: list[dict[str, Any]] = file.read(columns=[leaf for leaf, _, _ in leaves.values()]).to_pylist()
         return rows
 
 
