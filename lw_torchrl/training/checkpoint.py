@@ -135,7 +135,7 @@ def _write(path: AnyPath, kind: str, description: Mapping[str, Any], tensors: An
 def _load(path: Path, kind: str, make: Callable[[Any], nn.Module]) -> Any:
     description, tensors = _read(path, kind)
     try:
-        with AllocationLimit(100_000_000 + 20 * path.stat().st_size):
+        with AllocationLimit(500_000_000 + 20 * path.stat().st_size):
             module = make(description[kind])
         _copy_tensors(tensors, contents_of(module))
     except ImportError:
