@@ -263,6 +263,13 @@ def _finite(text: str) -> float:
     raise ValueError(f"the JSON must contain only finite numbers, got {text[:40]}")
 
 
+def check_damage(error: Exception) -> None:
+    """Raise ``error`` again if it shows a limit of the system, such as too many open files, and not damage."""
+    expected = (None, errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EINVAL)
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno not in expected):
+        raise error
+
+
 @contextmanager
 def reading(path: AnyPath, what: str) -> Iterator[None]:
     """Add the folder's ``path`` and the expected content ``what`` to errors raised in the block."""
@@ -273,4 +280,5 @@ def reading(path: AnyPath, what: str) -> Iterator[None]:
             f"path: {str(path)!r} holds no {what} ({error.filename} is missing); use dumps() to save the {what}"
         ) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
+        check_damage(error)
         raise ValueError(f"path: {str(path)!r} holds no {what} ({error})") from error

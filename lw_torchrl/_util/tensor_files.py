@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Mapping
+from contextlib import ExitStack
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from lw_torchrl._util.files import AnyPath, parse_json, replacing
 from lw_torchrl._util.reproducibility import package_versions
@@ -45,7 +48,9 @@ def read_tensors(path: AnyPath) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if Path(path).is_dir():
         inside = ", ".join(file.name for file in sorted(Path(path).glob(f"*{SUFFIX}"))[:3])
         raise ValueError("the path is a folder" + (f"; use a file in the folder: {inside}" if inside else ""))
-    Path(path).open("rb").close()  # raises FileNotFoundError with the path, which safetensors' error lacks
+    with ExitStack() as stack:  # safe_open opens the file several times, and its own errors do not name limits
+        for _ in range(3):
+            stack.enter_context(Path(path).open("rb"))
     try:
         with safe_open(path, framework="pt") as file:
             description = parse_json((file.metadata() or {})[_METADATA].encode())
@@ -58,6 +63,28 @@ def read_tensors(path: AnyPath) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if _checksum(description, tensors) != stored:
         raise ValueError("the file is corrupted: checksum mismatch")
     return description, tensors
+
+
+class AllocationLimit(TorchDispatchMode):
+    """A context in which creating more than ``allowed`` bytes of tensors raises a :class:`ValueError`.
+
+    A module that is rebuilt from a file's description must not be much larger than the tensors in the file.
+    """
+
+    _FACTORIES = ("empty", "zeros", "ones", "full", "rand", "randn", "arange", "eye", "new_empty", "new_zeros")
+
+    def __init__(self, allowed: int) -> None:
+        super().__init__()
+        self.allowed = allowed
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func.overloadpacket.__name__ in self._FACTORIES:
+            sizes = [size for arg in args for size in (arg if isinstance(arg, (list, tuple)) else (arg,))]
+            numbers = prod(size for size in sizes if isinstance(size, int) and size > 0)
+            self.allowed -= 4 * numbers
+            if self.allowed < 0:
+                raise ValueError("the description is of larger tensors than the file holds")
+        return func(*args, **kwargs or {})
 
 
 def _text(description: Mapping[str, Any]) -> str:

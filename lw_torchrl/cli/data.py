@@ -223,21 +223,29 @@ class Import:
     Example: lw-torchrl data import lerobot/mt10 --out demos/mt10
     """
 
-    source: Positional[Annotated[Path, arg(metavar="SOURCE")]]  # LeRobot or Minari folder, or robomimic HDF5 file
+    source: Positional[Annotated[Path, arg(metavar="SOURCE")]]  # LeRobot or Minari folder, parquet or HDF5 file
     out: Path  # output folder, new or empty
     format: Maybe[str] = None  # format of the source (default: detected from the files)
     task: Maybe[str] = None  # task of all episodes, if the source does not name one
+    task_map: Annotated[Maybe[Path], arg(metavar="FILE")] = None
+    """JSON object: the task for each of the source's task names or numbers, such as {"0": "push"}"""
     suite: options.SuiteName = None
     behaviour: str = "imported"  # label of the episodes
     episodes: Maybe[Count] = None  # import only the first N episodes of each task
+    episode_length: Maybe[Count] = None  # steps of each episode, if the source does not state where episodes end
     json: options.Json = False
 
     def run(self) -> Output:
+        from lw_torchrl._util.files import read_json
         from lw_torchrl.data.exchange import MissingDataWarning
 
+        if self.task is not None and self.task_map is not None:
+            raise ValueError("--task and --task-map exclude each other; use --task-map for several tasks")
+        task = self.task if self.task_map is None else read_json(self.task_map, "--task-map:")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            about: dict[str, Any] = {"format": self.format, "task": self.task, "behaviour": self.behaviour}
+            about: dict[str, Any] = {"format": self.format, "task": task, "behaviour": self.behaviour}
+            about["episode_length"] = self.episode_length
             suite = options.read_suite(self.suite) or "metaworld"
             dataset = lw.import_dataset(self.source, self.out, suite=suite, episodes_per_task=self.episodes, **about)
         rows = [{"task": task, "success": rate} for task, rate in dataset.success_rate.items()]

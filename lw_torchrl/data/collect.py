@@ -24,7 +24,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._util.checks import Count, Scale, differences, typed
 from lw_torchrl._util.devices import CPU, device_of
-from lw_torchrl._util.files import AnyPath, flush, locked, read_json, replacing, write_json
+from lw_torchrl._util.files import AnyPath, check_damage, flush, locked, read_json, replacing, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl._util.reproducibility import SIMULATORS, package_versions, version_changes
 from lw_torchrl._util.workers import Episodes, spread
@@ -80,6 +80,7 @@ class EpisodeFiles:
                 columns = {key: torch.from_numpy(arrays["/".join(key)]) for key in _STORED}
             return TensorDict(columns, [len(columns["episode",])])
         except Exception as error:  # zipfile and numpy raise many kinds of errors for corrupted files
+            check_damage(error)
             message = f"root: {str(path)!r} is corrupted ({error}); delete this file to run the episode again"
             raise DatasetError(message) from error
 

@@ -31,7 +31,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._util.checks import Count, Scale, typed_fields
-from lw_torchrl._util.files import AnyPath, flush, read_json, write_json
+from lw_torchrl._util.files import AnyPath, check_damage, flush, read_json, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.collection_policy import EXPERT, NOISY, Behaviour, check_own_label
 from lw_torchrl.envs.episodes import first_success
@@ -321,6 +321,7 @@ def load_rows(demonstrations: Demonstrations) -> TensorDict:
             for key, (shape, dtype) in columns_of(demonstrations.config.layout).items()
         }
     except (OSError, ValueError, RuntimeError) as error:
+        check_damage(error)
         raise damaged(f"the rows in {str(folder)!r} are corrupted ({error})") from error
     return TensorDict(columns, [number], device="cpu")
 

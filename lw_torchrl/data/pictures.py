@@ -20,7 +20,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv, step_mdp
 
 from lw_torchrl._util.checks import Count, typed
-from lw_torchrl._util.files import AnyPath, replacing
+from lw_torchrl._util.files import AnyPath, check_damage, replacing
 from lw_torchrl._util.progress import Progress
 from lw_torchrl._util.rendering import check_cameras
 from lw_torchrl.data import dataset
@@ -62,8 +62,11 @@ class Pictures:
             with zipfile.ZipFile(path) as archive:
                 for number in range(len(pictures)):
                     with Image.open(archive.open(f"{number}.png"), formats=["PNG"]) as picture:
+                        if picture.size != (pictures.shape[2], pictures.shape[1]):  # before it is decompressed
+                            raise ValueError(f"picture {number} has {picture.size[0]} x {picture.size[1]} pixels")
                         pictures[number] = np.asarray(picture)
         except Exception as error:  # zipfile and PIL raise many kinds of errors for corrupted files
+            check_damage(error)
             message = f"root: {str(path)!r} is corrupted ({error}); delete this file and call add_pictures"
             raise DatasetError(message) from error
         return torch.from_numpy(pictures)

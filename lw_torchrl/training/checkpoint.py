@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from lw_torchrl._util.checks import differences, typed
 from lw_torchrl._util.files import AnyPath, absent_policy, companion, expanded, locked, shipped_policy
 from lw_torchrl._util.reproducibility import LIBRARIES, warn_of_other_versions
-from lw_torchrl._util.tensor_files import pop_state, read_tensors, write_tensors
+from lw_torchrl._util.tensor_files import AllocationLimit, pop_state, read_tensors, write_tensors
 from lw_torchrl.language.plans import AnyPlans, PlanError, as_plans
 from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
 from lw_torchrl.modules.describe import describe, from_description, same_keys
@@ -135,7 +135,8 @@ def _write(path: AnyPath, kind: str, description: Mapping[str, Any], tensors: An
 def _load(path: Path, kind: str, make: Callable[[Any], nn.Module]) -> Any:
     description, tensors = _read(path, kind)
     try:
-        module = make(description[kind])
+        with AllocationLimit(500_000_000 + 20 * path.stat().st_size):
+            module = make(description[kind])
         _copy_tensors(tensors, contents_of(module))
     except ImportError:
         raise

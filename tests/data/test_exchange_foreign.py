@@ -101,16 +101,19 @@ def test_actions_beyond_one_are_clipped(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"action": None}, "requires a column 'action' with 4 numbers"),
+        ({"action": None}, "column 'action' needs 4 numbers"),
         (
             {"observation.environment_state": None},
-            r"requires a column 'observation' .* observation.state \(4\)",
+            r"column 'observation' needs 39 .* observation.state \(4\)",
         ),
         ({"action": [[0.0] * 4] * 8 + [[float("nan")] * 4]}, "action holds NaN"),
-        ({"action": [[0.0] * 4] * 8 + [None]}, "action must have the same number of values"),
-        ({"action": [[0.0] * 4] * 8 + [[0.0] * 3]}, "action must have the same number of values"),
+        ({"action": [[0.0] * 4] * 8 + [None]}, r"column 'action' needs .* action \(different sizes\)"),
+        ({"action": [[0.0] * 4] * 8 + [[0.0] * 3]}, r"column 'action' needs .* action \(different sizes\)"),
+        ({"action": [[0.0] * 4] * 7 + [[0.0] * 3, [0.0] * 5]}, "action must have the same number of values"),
         ({"next.success": [0.0] * 8 + [0.3]}, "next.success must hold booleans"),
-        ({"task_index": [0, 0, 0, 1, 1, 1, 2, 2, 2]}, "task_index must be the same"),
+        ({"episode_index": [0.0] * 8 + [float("nan")]}, "episode_index must hold whole numbers, but holds nan"),
+        ({"frame_index": [0, 1, 2, 3, 0, 1, 0, 1, None]}, "frame_index must hold whole numbers, but holds nan"),
+        ({"frame_index": [0, 1, 1, 3, 0, 1, 0, 1, 2]}, "frame_index must differ"),
     ],
 )
 def test_unsuitable_columns_are_errors(tmp_path, changed, message):
@@ -181,7 +184,7 @@ def test_other_hdf5_is_an_error_with_the_path(tmp_path):
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "flat.hdf5", "w") as file:
         file["observations"] = STATES
-    with pytest.raises(ExchangeError, match=r"flat\.hdf5 has no group"):
+    with pytest.raises(ExchangeError, match=r"flat\.hdf5.*no group with actions"):
         lw.import_dataset(tmp_path / "flat.hdf5", tmp_path / "out")
     (tmp_path / "broken.hdf5").write_bytes(b"no rows at all")
     with pytest.raises(ExchangeError, match=r"broken\.hdf5'"):
@@ -205,3 +208,118 @@ def test_minari_datasets_are_imported(tmp_path, monkeypatch):
     made = lw.import_dataset(tmp_path / "minari" / "reach" / "theirs-v0", tmp_path / "out", task="reach")
     assert (made.num_steps, made.success_rate) == (8, {"reach": 1.0})
     np.testing.assert_array_equal(load_rows(made)["next", "observation"], STATES[1:].astype(np.float32))
+
+
+# ---- files of other kinds
+
+
+def flat(path, **changed):
+    """Write parquet with LeRobot's columns and no metadata: 6 rows of push."""
+    columns = {"observation": list(STATES[:6]), "action": list(ACTIONS[:6]), "episode_index": [0] * 3 + [1] * 3}
+    columns |= {"task": ["push"] * 6, **changed}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.table({name: column for name, column in columns.items() if column is not None}), path)
+    return path
+
+
+def test_parquet_files_are_sorted_by_number_and_hidden_files_skipped(tmp_path):
+    for number in (10, 9, 100):
+        flat(tmp_path / "in" / f"part{number}.PQ", episode_index=None, task=None, reward=[float(number)] * 6)
+    for name in ("._part9.PQ", "__MACOSX/part1.pq", ".ipynb_checkpoints/part2.pq"):
+        (tmp_path / "in" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "in" / name).write_bytes(b"\0\5\x16\7")
+    made = imported(tmp_path / "in", tmp_path / "out", "ends of episodes", task="push", episode_length=6)
+    assert load_rows(made)["next", "reward_dense"].flatten().tolist() == [9.0] * 6
+    every = imported(tmp_path / "in", tmp_path / "all", "ends", task="push", episode_length=6, episodes_per_task=3)
+    assert load_rows(every)["next", "reward_dense"].flatten()[::6].tolist() == [9.0, 10.0, 100.0]
+
+
+@pytest.mark.parametrize("name", ["state", "done", "next.reward_sparse", "expert_action", "notes"])
+@pytest.mark.parametrize("values", [["x"] * 6, [None] * 6, [{"a": 1}] * 6, [[1], [], [1, 2]] * 2, [float("nan")] * 6])
+def test_columns_that_are_not_needed_never_matter(tmp_path, name, values):
+    source = flat(tmp_path / "a.parquet", **{name: values}, success=[False] * 6)
+    assert imported(source, tmp_path / "out", "lacks", episodes_per_task=2).num_steps == 6
+
+
+def test_two_dimensional_columns_and_other_dtypes_are_read(tmp_path):
+    grid = [row.reshape(3, 13).tolist() for row in STATES[:6]]
+    index = pa.array([0] * 3 + [1] * 3, pa.uint8())
+    made = imported(flat(tmp_path / "a.parquet", observation=grid, episode_index=index), tmp_path / "out", "lacks")
+    np.testing.assert_array_equal(load_rows(made)["observation"], STATES[:3].astype(np.float32))
+
+
+@pytest.mark.parametrize("mapping", [{4: "push"}, {"4": "push-v3"}, {"push": 4}])
+def test_numbers_of_tasks_are_mapped(tmp_path, mapping):
+    source = flat(tmp_path / "a.parquet", task=None, task_index=[4] * 6)
+    with pytest.raises(ValueError, match=r"task must be one of .* got '4'.*map it"):
+        lw.import_dataset(source, tmp_path / "out")
+    assert imported(source, tmp_path / "out", "lacks", task=mapping).config.tasks == ("push",)
+
+
+def test_subsets_of_episodes_are_imported_with_a_warning(tmp_path):
+    source = lerobot(tmp_path / "theirs")
+    (source / "data/chunk-000/episode_000001.parquet").unlink()
+    made = imported(source, tmp_path / "out", "lists 9, but the data files hold 7", episodes_per_task=2)
+    assert [info.length for info in made.episodes] == [4, 3]
+
+
+@pytest.mark.parametrize(
+    ("marks", "options", "lengths"),
+    [
+        ({"timeouts": [0, 0, 1, 0, 0, 0, 0, 0, 1]}, {}, [3, 6]),
+        ({"terminals": [0] * 9}, {"episode_length": 3}, [3, 3, 3]),
+        ({"dones": [0, 0, 0, 1, 1, 1, 1, 1, 1]}, {}, [9]),
+    ],
+)
+def test_ends_of_episodes_are_derived_for_flat_hdf5(tmp_path, marks, options, lengths):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.H5", "w") as file:
+        file["observations"], file["actions"] = STATES, ACTIONS
+        for name, values in marks.items():
+            file[name] = np.array(values, bool)
+    each = {"episodes_per_task": len(lengths), **options}
+    made = imported(tmp_path / "a.H5", tmp_path / "out", "lacks", task="push", **each)
+    assert [info.length for info in made.episodes] == lengths
+    if options:
+        with pytest.raises(ValueError, match="episode_length must divide"):
+            lw.import_dataset(tmp_path / "a.H5", tmp_path / "none", task="push", episode_length=4)
+
+
+def test_maniskill_files_are_imported(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "trajectory.h5", "w") as file:
+        for number in (0, 10, 2):
+            file[f"traj_{number}/obs"] = np.resize(STATES, (10, 39))
+            file[f"traj_{number}/actions"], file[f"traj_{number}/rewards"] = ACTIONS, np.full(9, float(number + 2))
+    (tmp_path / "trajectory.json").write_text(json.dumps({"env_info": {"env_id": "push-v3"}, "episodes": []}))
+    made = imported(tmp_path, tmp_path / "out", "lacks success", episodes_per_task=3)
+    assert load_rows(made)["next", "reward_dense"].flatten()[::9].tolist() == [2.0, 4.0, 12.0]
+
+
+def test_small_files_that_declare_too_much_are_refused(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        group = file.create_group("data/demo_0")
+        group.create_dataset("actions", (10**9, 4), "f4")
+        group.create_dataset("obs/state", (10**9, 39), "f4")
+    text = pa.DictionaryArray.from_arrays(pa.array(np.zeros(60_000, np.int32)), pa.array(["x" * 20_000]))
+    rows = {"observation": list(np.zeros((60_000, 39), np.float32)), "action": list(np.zeros((60_000, 4), np.float32))}
+    table = pa.table({**rows, "episode_index": np.zeros(60_000, int), "task": text})
+    pq.write_table(table, tmp_path / "b.parquet", store_schema=False, compression="zstd")
+    for name in ("a.hdf5", "b.parquet"):
+        assert (tmp_path / name).stat().st_size < 10**5
+        with pytest.raises(ExchangeError, match=f"{name}.*declare"):
+            lw.import_dataset(tmp_path / name, tmp_path / "out", task="push")
+
+
+def test_limits_of_the_system_are_not_called_damage(tmp_path, monkeypatch):
+    from lw_torchrl.data import dataset
+
+    made = imported(flat(tmp_path / "a.parquet"), tmp_path / "out", "lacks", episodes_per_task=2)
+
+    def no_files(*_):
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(dataset.np, "memmap", no_files)
+    with pytest.raises(OSError, match="Too many open files"):
+        load_rows(made)

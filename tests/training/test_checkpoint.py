@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -311,3 +312,14 @@ def test_a_flipped_bit_is_detected(path):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match="is corrupted"):
             lw.load_actor(path)
+
+
+def test_a_small_file_cannot_describe_a_huge_policy(tmp_path):
+    actor = lw.PlanConditionedActor(lw.load_plans("MT10"), decoder=lw.modules.MLPDecoder(width=3, depth=1))
+    lw.save_actor(actor, tmp_path / "a.safetensors")
+    description, _ = read_tensors(tmp_path / "a.safetensors")
+    changed = json.dumps(description).replace('"width": 3', '"width": 50000').replace('"depth": 1', '"depth": 2')
+    assert "50000" in changed
+    write_tensors(tmp_path / "b.safetensors", json.loads(changed), {})
+    with pytest.raises(ValueError, match="larger tensors than the file holds"):
+        lw.load_actor(tmp_path / "b.safetensors")

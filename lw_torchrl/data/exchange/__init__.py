@@ -10,19 +10,21 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from lw_torchrl._util.checks import Count, typed
-from lw_torchrl._util.files import AnyPath, read_json, replacing_folder
+from lw_torchrl._util.files import AnyPath, parse_json, read_json, replacing_folder
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.dataset import METADATA, Demonstrations, parse_metadata, read_metadata
-from lw_torchrl.data.exchange.table import (
+from lw_torchrl.data.exchange.imported import (
     ExchangeError,
-    Table,
     complete_columns,
     describe,
     exported_columns,
-    table_of,
+    find_ends,
+    read_files,
     task_names,
     write_dataset,
 )
+from lw_torchrl.data.exchange.reader import HDF5, PARQUET, data_files
+from lw_torchrl.data.exchange.table import ABOUT, table_of
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.suites.suite import Suite, find_suite, load_suite
 
@@ -34,7 +36,8 @@ __all__ = [
 ExportFormat = Literal["lerobot", "minari"]
 ImportFormat = Literal["lerobot", "minari", "robomimic"]
 FORMATS: tuple[str, ...] = get_args(ExportFormat)
-_EXTRAS = {"av": "exchange", "h5py": "exchange", "minari": "minari"}  # the extra that installs each package
+_EXTRAS = {"av": "exchange", "h5py": "exchange", "pyarrow": "exchange", "minari": "minari"}
+"""The extra that installs each package."""
 
 
 class MissingDataWarning(UserWarning):
@@ -42,15 +45,15 @@ class MissingDataWarning(UserWarning):
 
 
 @contextmanager
-def _format(name: str) -> Iterator[Any]:
-    """Yield the module for a format; if a package is missing, raise an ImportError that names the extra to install."""
+def _needing(format: str) -> Iterator[None]:
+    """If a package for a format is missing, raise an ImportError that names the extra to install."""
     try:
-        yield import_module(f"lw_torchrl.data.exchange.{name}")
+        yield
     except ModuleNotFoundError as error:
         if (extra := _EXTRAS.get((error.name or "").partition(".")[0])) is None:
             raise
         install = f"pip install 'lw_torchrl[{extra}]'"
-        raise ImportError(f"format {name!r} requires {error.name}, which is not installed: {install}") from error
+        raise ImportError(f"format {format!r} requires {error.name}, which is not installed: {install}") from error
 
 
 @typed
@@ -95,8 +98,8 @@ def export_dataset(
     target = _new_folder(out)
     metadata = read_json(demonstrations.root / METADATA, "root: the metadata")
     table = table_of(demonstrations, metadata, suite, suite.plans if plans is None else as_plans(plans))
-    with replacing_folder(target) as folder, Progress("exporting", table.rows, "row") as bar, _format(format) as module:
-        module.write(table, folder, bar)
+    with replacing_folder(target) as folder, Progress("exporting", table.rows, "row") as bar, _needing(format):
+        import_module(f"lw_torchrl.data.exchange.{format}").write(table, folder, bar)
     return target
 
 
@@ -106,10 +109,11 @@ def import_dataset(
     out: AnyPath,
     *,
     format: ImportFormat | None = None,
-    task: str | Mapping[str, str] | None = None,
+    task: str | Mapping[str | int, str | int] | None = None,
     suite: str | Suite = "metaworld",
     behaviour: str = "imported",
     episodes_per_task: Count | None = None,
+    episode_length: Count | None = None,
 ) -> Demonstrations:
     """Convert files of another format to a dataset, and return the dataset's description.
 
@@ -118,43 +122,57 @@ def import_dataset(
     and the values that replace missing columns. Load such a dataset with ``label="executed"``, because it has no expert
     actions.
 
+    A child process with a limit on memory and on time reads the files, because damaged or hostile files can make
+    pyarrow and HDF5 allocate gigabytes or never return.
+
     Args:
         source: the file or folder to import.
         out: the dataset's folder, which must be new or empty.
-        format: "lerobot", "minari" or "robomimic" (HDF5, also LIBERO's); None to detect the format from the files.
-        task: the task of all episodes, or a mapping from the file's task names to lw_torchrl's; None if the file has
-            lw_torchrl's task names or descriptions, or Meta-World's task names, such as "reach-v3".
+        format: "lerobot" (also parquet files without LeRobot's metadata), "minari", or "robomimic" (HDF5, also
+            LIBERO's and ManiSkill's); None to detect the format from the files.
+        task: the task of all episodes, or a mapping from the file's task names or numbers to lw_torchrl's names; None
+            if the file has lw_torchrl's task names or descriptions, or Meta-World's task names, such as "reach-v3".
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks.
         behaviour: the label of the episodes, for :class:`EpisodeFilter`.
         episodes_per_task: import only the first N episodes of each task; None for all.
+        episode_length: the number of steps of each episode, for files that do not state where episodes end; None for
+            the suite's number of steps.
 
     Warns:
         MissingDataWarning: (a UserWarning) columns are missing; the message names the values used instead.
 
     Raises:
-        ExchangeError: (a ValueError) ``source`` is corrupted, of another format, or lacks observations or actions.
+        ExchangeError: (a ValueError) ``source`` is corrupted, of another format, lacks observations or actions, or
+            declares more data than its size allows.
         ValueError: a task is unknown, the tasks have different numbers of episodes, or ``out`` is not an empty folder.
         ImportError: the format requires a package that is not installed; the message names the extra.
+        OSError: the system cannot read the files, for example because too many files are open.
 
-    Source: LeRobot's format 2.0 to 3.0, Minari, robomimic's HDF5 layout.
+    Source: LeRobot's format 2.0 to 3.0, Minari, robomimic's, LIBERO's and ManiSkill's HDF5 layouts.
     """
     source, target = Path(source), _new_folder(out)
     if not source.exists():
         raise FileNotFoundError(f"source: no such file or folder {str(source)!r}")
-    with _format(_format_of(source) if format is None else format) as module, _reading(source):
-        table: Table = module.read(source)
-    if table.metadata is not None:
+    format = _format_of(source) if format is None else format
+    with _reading(source):
+        metadata = _own_metadata(source)
+        description = None if metadata is None else parse_metadata(metadata, target)
+    if description is not None:
         options = {"task": task is not None, "episodes_per_task": episodes_per_task is not None}
         options |= {"suite": suite != "metaworld", "behaviour": behaviour != "imported"}
+        options |= {"episode_length": episode_length is not None}
         if given := [name for name, is_given in options.items() if is_given]:
             raise ValueError(f"{given[0]} must not be given: {str(source)!r} was written by export_dataset")
-        with _reading(source):
-            description = parse_metadata(table.metadata, target)
+        with _needing(format), _reading(source):
+            table = read_files(source, format != "lerobot", description.config.layout)
             columns, spans = exported_columns(table), [*table.spans()]
             if tuple(episode.length for episode in description.episodes) != table.lengths:
                 raise ExchangeError("the episodes' lengths differ from those in the exported metadata")
         return write_dataset(columns, spans, description, target, exported_as=source)
     suite = load_suite(suite)
+    with _needing(format), _reading(source):
+        table = read_files(source, format != "lerobot", suite.layout)
+    table = find_ends(table, suite, episode_length)
     names = task_names(table, suite, task)
     description, spans = describe(names, table, suite, behaviour, episodes_per_task)
     with _reading(source):
@@ -169,12 +187,12 @@ def _reading(source: Path) -> Iterator[None]:
     """Add the path of the source to errors raised within a ``with`` block."""
     try:
         yield
-    except (ImportError, MemoryError):
-        raise
     except ExchangeError as error:
         raise ExchangeError(f"source: {str(source)!r}: {error}") from error
-    except Exception as error:  # pyarrow, h5py and Minari raise many kinds of errors for corrupted files
-        raise ExchangeError(f"source: {str(source)!r} is corrupted ({type(error).__name__}: {error})") from error
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise ExchangeError(
+            f"source: {str(source)!r} has invalid metadata ({type(error).__name__}: {error})"
+        ) from error
 
 
 def _new_folder(out: AnyPath) -> Path:
@@ -190,8 +208,19 @@ def _format_of(source: Path) -> ImportFormat:
         return "lerobot"
     if (source / "data" / "metadata.json").is_file() or (source / "main_data.hdf5").is_file():
         return "minari"
-    if {path.suffix for path in ([source] if source.is_file() else source.iterdir())} & {".hdf5", ".h5"}:
-        return "robomimic"
+    for format, endings in (("robomimic", HDF5), ("lerobot", PARQUET)):
+        if any(path.suffix.lower() in endings for path in data_files(source, endings)):
+            return format  # type: ignore[return-value]
     raise ExchangeError(
         f"source: {str(source)!r} is not a LeRobot dataset, Minari dataset or robomimic HDF5 file; if it is, set format"
     )
+
+
+def _own_metadata(source: Path) -> Mapping[str, Any] | None:
+    """Return the dataset's metadata from files that :func:`export_dataset` wrote; None for other files."""
+    if (path := source / "meta" / f"{ABOUT}.json").is_file():
+        return read_json(path, "our metadata")
+    for path in (source / "data" / "metadata.json", source / "metadata.json"):
+        if path.is_file() and (text := read_json(path, "Minari's metadata").get(ABOUT)):
+            return parse_json(str(text).encode())
+    return None

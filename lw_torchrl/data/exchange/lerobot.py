@@ -1,4 +1,4 @@
-"""Write LeRobot datasets in version 3, and read LeRobot datasets in version 2.0, 2.1 or 3.
+"""Write LeRobot datasets in version 3.
 
 meta/info.json                                    the columns with types and shapes; time steps per second
 meta/stats.json                                   min, max, mean, std and count of each column
@@ -7,8 +7,6 @@ meta/episodes/chunk-000/file-000.parquet          location and statistics of eac
 data/chunk-000/file-000.parquet                   the time steps
 videos/CAMERA/chunk-000/file-000.mp4              the pictures of ``add_pictures``
 meta/lw_torchrl.json                              the metadata of the lw_torchrl dataset, which LeRobot ignores
-
-Version 2 has one data file per episode, and ``meta/tasks.jsonl``.
 """
 
 from __future__ import annotations
@@ -20,11 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from lw_torchrl._util.checks import shown
-from lw_torchrl._util.files import read_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.dataset import Demonstrations
-from lw_torchrl.data.exchange.table import ABOUT, KNOWN, NAMES, Array, ExchangeError, Table
+from lw_torchrl.data.exchange.reader import NAMES
+from lw_torchrl.data.exchange.table import ABOUT, Array, Table
 from lw_torchrl.data.pictures import Pictures
 
 INFO, ABOUT_FILE = "meta/info.json", f"meta/{ABOUT}.json"
@@ -91,7 +88,6 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
         episodes |= {f"stats/{name}/{kind}": [stats[kind].tolist() for stats in each] for kind in each[0]}
         if np.isfinite(values).all():  # JSON has no NaN
             statistics[name] = {kind: value.tolist() for kind, value in _combined(each).items()}
-    assert table.demonstrations is not None
     for key, pictures in _existing_pictures(table.demonstrations).items():
         features[key] = _video_feature(pictures, table.fps)
         places, each = _write_videos(table.demonstrations, pictures, folder, key, table.fps)
@@ -223,66 +219,3 @@ def _write_videos(
                     bar.update(episode.length)
                 container.mux(stream.encode())
     return places, each
-
-
-def _numbers(name: str, column: Any) -> Array:
-    """Convert an Arrow column to an array of numbers, (R,) or (R, n)."""
-    import pyarrow as pa
-
-    column = column.combine_chunks()
-    if not pa.types.is_nested(column.type):
-        values = column
-    elif column.null_count or len(column.value_lengths().unique()) > 1:
-        raise ExchangeError(f"{name} must have the same number of values in every row")
-    else:
-        values = column.flatten()
-    if values.null_count:
-        raise ExchangeError(f"{name} must have a value in every row, but {values.null_count} values are missing")
-    return values.to_numpy(zero_copy_only=False).reshape((len(column), -1) if values is not column else -1)
-
-
-def _steps(source: Path, frames: Any) -> dict[str, Array]:
-    """Read the known columns of the data files, sorted by episode and frame."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    paths = sorted(path for path in (source / "data").rglob("*.parquet") if not path.name.startswith("."))
-    rows = sum(pq.read_metadata(path).num_rows for path in paths)
-    if not rows or rows != frames:  # checked before the rows are loaded into memory
-        raise ExchangeError(f"{INFO} lists {frames} time steps, but the data files hold {rows}")
-    known = KNOWN | {"episode_index", "frame_index", "task_index"}
-    names = [name for name in pq.read_schema(paths[0]).names if name in known]
-    table = pa.concat_tables(pq.read_table(path, columns=names, partitioning=None) for path in paths)
-    columns = {name: _numbers(name, table.column(name)) for name in names}
-    frame = columns.pop("frame_index", np.arange(rows))
-    order = np.lexsort((frame, columns["episode_index"]))
-    return {name: column[order] for name, column in columns.items()}
-
-
-def _task_texts(source: Path) -> dict[int, str]:
-    """Map each task_index to the task's name, or to its description if the file stores no task names."""
-    import pyarrow.parquet as pq
-
-    lines = source / "meta" / "tasks.jsonl"
-    if lines.is_file():  # versions 2.0 and 2.1
-        tasks = [json.loads(line) for line in lines.read_text("utf-8").splitlines() if line.strip()]
-    else:
-        tasks = pq.read_table(source / "meta" / "tasks.parquet").to_pylist()
-    names = [name for name in ("name", "task", "__index_level_0__") if name in tasks[0]]
-    return {task["task_index"]: str(task[names[0]]) for task in tasks}
-
-
-def read(source: Path) -> Table:
-    """Read a LeRobot dataset of version 2.0, 2.1 or 3.0 as a table."""
-    info = read_json(source / INFO, "the description")
-    if not (version := str(info["codebase_version"])).startswith(("v2.", "v3.")):
-        raise ExchangeError(f"LeRobot format version {shown(version)} is not supported; use v2.0 to v3.0")
-    columns = _steps(source, info["total_frames"])
-    starts = np.flatnonzero(np.diff(columns["episode_index"], prepend=-1))
-    lengths = np.diff(starts, append=len(columns["episode_index"]))
-    texts, number = _task_texts(source), columns.pop("task_index")
-    if (number != np.repeat(number[starts], lengths)).any():
-        raise ExchangeError("task_index must be the same in all rows of an episode")
-    tasks = tuple(texts[task] for task in number[starts].tolist())
-    metadata = read_json(source / ABOUT_FILE, "our metadata") if (source / ABOUT_FILE).is_file() else None
-    return Table(columns, tuple(lengths.tolist()), tasks, metadata=metadata)

@@ -1,4 +1,4 @@
-"""Write and read Minari datasets with the minari package.
+"""Write Minari datasets with the minari package.
 
 data/main_data.hdf5    a group for each episode: observations (T + 1, 39), actions (T, 4), dense rewards, terminations
                        and truncations (T,), and infos/... (T + 1, ...). success and reward_sparse describe the
@@ -11,19 +11,17 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lw_torchrl._util.files import parse_json
 from lw_torchrl._util.progress import Progress
-from lw_torchrl.data.exchange.table import ABOUT, HOLDS, NAMES, TASK_NAMES, Array, Table
+from lw_torchrl.data.exchange.table import ABOUT, HOLDS, Array, Table
 
 _AFTER = ("success", "reward_sparse")
 _BEFORE = ("expert_action", "unclipped_action", HOLDS, "next_observation")
-_OF_STEP = {*NAMES["success"], *NAMES["reward_sparse"], *NAMES["reward_dense"]}
 
 
 def _infos(table: Table, start: int, end: int) -> dict[str, Array]:
@@ -93,40 +91,3 @@ def _reserve(file: Path, size: int) -> None:
     if hasattr(os, "posix_fallocate"):  # not on macOS
         with file.open("r+b") as handle:
             os.posix_fallocate(handle.fileno(), 0, file.stat().st_size + size)
-
-
-def _flat(name: str, value: Any) -> dict[str, Array]:
-    """Flatten nested mappings of arrays to one mapping, whose names are joined by dots."""
-    if isinstance(value, Mapping):
-        return {key: array for inner, part in value.items() for key, array in _flat(f"{name}.{inner}", part).items()}
-    return {name: np.asarray(value)}
-
-
-def _columns(episode: Mapping[str, Any]) -> dict[str, Array]:
-    """Convert a Minari episode to columns with one row per time step."""
-    steps = len(episode["rewards"])
-    columns = {name: np.asarray(episode[name]) for name in ("rewards", "terminations", "truncations")}
-    columns |= _flat("actions", episode["actions"])
-    for name, values in _flat("observations", episode["observations"]).items():
-        columns[name] = values[:-1]
-        if name in NAMES["observation"]:
-            columns["next_observations"] = values[1:]
-    for name, values in _flat("infos", episode["infos"] or {}).items():
-        if len(values) == steps + 1 and values.dtype.kind in "biuf":
-            columns[name] = values[1:] if name in _OF_STEP else values[:-1]
-    return columns
-
-
-def read(source: Path) -> Table:
-    """Read a Minari dataset as a table."""
-    from minari.dataset.minari_storage import MinariStorage
-
-    storage = MinariStorage.read(source / "data" if (source / "data").is_dir() else source)
-    numbers = range(storage.total_episodes)
-    parts = [_columns(episode) for episode in storage.get_episodes(numbers)]
-    metadata = [*storage.get_episode_metadata(numbers)]
-    text = storage.metadata.get(ABOUT)
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    tasks = (next((str(episode[name]) for name in TASK_NAMES if name in episode), "") for episode in metadata)
-    lengths = tuple(len(part["rewards"]) for part in parts)
-    return Table(columns, lengths, tuple(tasks), metadata=parse_json(str(text).encode()) if text else None)

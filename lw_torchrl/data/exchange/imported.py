@@ -1,0 +1,315 @@
+"""Read the files of other formats in a child process, and convert their rows to a dataset."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from lw_torchrl._util.checks import shown, unknown_name
+from lw_torchrl._util.files import replacing_folder
+from lw_torchrl._util.progress import Progress
+from lw_torchrl.data import dataset
+from lw_torchrl.data.collection_policy import Behaviour
+from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations, EpisodeInfo
+from lw_torchrl.data.exchange import reader
+from lw_torchrl.data.exchange.table import ABOUT, KEYS, WIDE, Array
+from lw_torchrl.language.layout import Layout
+from lw_torchrl.language.tasks import task_id
+from lw_torchrl.suites.suite import Suite
+
+_SECONDS, _BYTES_PER_SECOND = 30, 1e6  # time limit of the child process: a constant, and a part for the files' size
+
+
+class ExchangeError(DatasetError):
+    """An error for a file that is corrupted, has an unknown format, or lacks columns that a dataset requires."""
+
+
+@dataclass(frozen=True)
+class ImportedTable:
+    """The rows of consecutive episodes in another format's files.
+
+    Attributes:
+        columns, sources: arrays (R, ...) by the names of :data:`KEYS`, and the columns' names in the files.
+        lengths, tasks: the number of rows and the possible names of the task of each episode.
+        ends_known: whether the files state where episodes end.
+        unfit: names in the files of columns whose sizes do not fit.
+        notes: what the files lack.
+    """
+
+    columns: Mapping[str, Array]
+    sources: Mapping[str, str]
+    lengths: tuple[int, ...]
+    tasks: tuple[tuple[str, ...], ...]
+    ends_known: bool
+    unfit: Mapping[str, str]
+    notes: tuple[str, ...]
+
+    @property
+    def rows(self) -> int:
+        return sum(self.lengths)
+
+    def spans(self) -> Iterator[tuple[int, int]]:
+        """Yield the start row and the end row (exclusive) of each episode."""
+        return pairwise(accumulate(self.lengths, initial=0))
+
+    def explain(self, name: str) -> str:
+        """Return the end of a warning for a missing column: the column whose size does not fit."""
+        return f" ({self.unfit[name]} does not have one number per row)" if name in self.unfit else ""
+
+
+def read_files(source: Path, is_hdf5: bool, layout: Layout) -> ImportedTable:
+    """Read HDF5 or parquet files in a child process with limits; see :mod:`.reader`."""
+    widths = {name: 1 if name not in WIDE else layout.action_size if "action" in name else layout.size for name in KEYS}
+    order = [name for name in reader.NAMES if name in widths]
+    stored = reader.stored_bytes(reader.data_files(source, reader.HDF5 if is_hdf5 else reader.PARQUET))
+    with TemporaryDirectory() as folder:
+        argument = json.dumps({name: widths[name] for name in order})
+        command = [
+            sys.executable,
+            "-P",
+            reader.__file__,
+            str(source.absolute()),
+            folder,
+            "hdf5" if is_hdf5 else "parquet",
+            argument,
+        ]
+        seconds = _SECONDS + stored / _BYTES_PER_SECOND
+        environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        try:
+            done = subprocess.run(
+                command, env=environment, capture_output=True, timeout=seconds, stdin=subprocess.DEVNULL
+            )
+        except subprocess.TimeoutExpired:
+            raise ExchangeError(f"reading {stored:,} bytes took more than {seconds:.0f} s, so it was stopped") from None
+        report = Path(folder, "table.json")
+        if done.returncode or not report.is_file():
+            last = done.stderr.decode("utf-8", "replace").strip().splitlines()[-1:]
+            raise ExchangeError(f"reading failed within its limit of memory (exit status {done.returncode}; {last})")
+        table: dict[str, Any] = json.loads(report.read_text("utf-8"))
+        if "refused" in table:
+            raise ExchangeError(table["refused"])
+        if "corrupted" in table:
+            raise ExchangeError(f"the files are corrupted ({table['corrupted']})")
+        if "missing" in table:
+            raise ModuleNotFoundError(f"no module named {table['missing']}", name=table["missing"])
+        if "system" in table:
+            raise OSError(*table["system"])
+        columns = {name: np.load(Path(folder, f"{name}.npy"), allow_pickle=False) for name in table.pop("columns")}
+    lengths, tasks, notes = tuple(table["lengths"]), tuple(map(tuple, table["tasks"])), tuple(table["notes"])
+    return ImportedTable(columns, table["sources"], lengths, tasks, table["ends_known"], table["unfit"], notes)
+
+
+def find_ends(table: ImportedTable, suite: Suite, episode_length: int | None) -> ImportedTable:
+    """Return a table whose episodes end; if the files do not state where, derive the ends, and note how.
+
+    Rows marked as done, terminated or truncated end an episode, unless they follow each other: then the marks are a
+    state, such as success. Otherwise, episodes have ``episode_length`` steps, or as many as the suite allows.
+    """
+    if table.ends_known:
+        if episode_length is not None:
+            raise ValueError(
+                f"episode_length must not be given, got {episode_length}: the files state the episodes' ends"
+            )
+        return table
+    marks = np.zeros(table.rows, dtype=bool)
+    for name in ("done", "terminated", "truncated"):
+        marks |= table.columns.get(name, marks).reshape(table.rows) == 1
+    if episode_length is not None or (marks[1:] & marks[:-1]).any():
+        marks[:] = False
+    limit, lengths, tasks, is_cut = episode_length or suite.max_steps, [], [], False
+    for (start, end), task in zip(table.spans(), table.tasks, strict=True):
+        inner = np.flatnonzero(marks[start:end]) + 1 + start
+        parts = [part for part in pairwise(np.unique([start, *inner, end]).tolist())]
+        for first, last in parts:
+            if len(parts) == 1 and (last - first) % limit and (last - first > limit or episode_length is not None):
+                hint = (
+                    f"the files do not state where episodes end, and {last - first} rows are not a multiple of {limit}"
+                )
+                wrong = "be given" if episode_length is None else "divide the number of rows"
+                raise ValueError(f"episode_length must {wrong}: {hint}")
+            number = -(-(last - first) // limit)
+            is_cut |= not inner.size or number > 1
+            lengths += [limit] * (number - 1) + [last - first - limit * (number - 1)]
+            tasks += [task] * number
+    note = f"the ends of episodes: {len(lengths)} episodes of at most {limit} steps are assumed"
+    return replace(table, lengths=tuple(lengths), tasks=tuple(tasks), notes=(*table.notes, *[note] * is_cut))
+
+
+def write_dataset(
+    columns: Mapping[str, Array],
+    spans: Sequence[tuple[int, int]],
+    description: Demonstrations,
+    out: Path,
+    exported_as: Path | None = None,
+) -> Demonstrations:
+    """Write rows as the described dataset, atomically, with one episode for each (start, end) in ``spans``.
+
+    If the rows come from an exported dataset (``exported_as``), they must match the checksums in the description.
+    """
+
+    def episodes() -> Iterator[tuple[str, int, TensorDict]]:
+        with Progress("importing", sum(end - start for start, end in spans), "row") as bar:
+            for info, (start, end) in zip(description.episodes, spans, strict=True):
+                rows = TensorDict({}, [end - start])
+                for name, key in KEYS.items():
+                    part = torch.from_numpy(np.array(columns[name][start:end], order="C"))
+                    rows.set(key, part if name in WIDE else part.unsqueeze(-1))
+                task = torch.full((end - start,), description.task_ids[info.task])
+                rows.set("task_id", task).set(("next", "task_id"), task)
+                rows.set("episode", torch.full_like(task, info.episode))
+                yield info.task, info.episode, rows
+                bar.update(end - start)
+
+    with replacing_folder(out) as folder:
+        infos = dataset.write_rows(folder / dataset.DATA, episodes(), description.config.layout)
+        if exported_as and infos != description.episodes:
+            raise ExchangeError(f"source: {str(exported_as)!r} is corrupted: the rows differ from their checksums")
+        dataset.write_metadata(replace(description, root=folder, episodes=infos))
+    return dataset.read_metadata(out)
+
+
+def exported_columns(table: ImportedTable) -> dict[str, Array]:
+    """Return the columns of a file written by :func:`export_dataset`."""
+    columns = dict(table.columns)
+    if "done" not in columns and {"terminated", "truncated"} <= columns.keys():  # Minari does not store "done" itself
+        columns["done"] = columns["terminated"] | columns["truncated"]
+    if lacking := [name for name in KEYS if name not in columns]:
+        raise ExchangeError(f"the exported column {lacking[0]} is missing")
+    return columns
+
+
+def complete_columns(table: ImportedTable, suite: Suite) -> tuple[dict[str, Array], list[str]]:
+    """Return all columns of a dataset from an imported table, and an explanation for each missing column."""
+    rows, lacking = table.rows, [*table.notes]
+    used = ["observation", "action", "next_observation", "reward_dense"]
+    used.append("success" if "success" in table.columns else "reward_sparse")  # other columns must not cause errors
+    columns: dict[str, Array] = {}
+    for name in [name for name in used if name in table.columns]:
+        column = table.columns[name].reshape((rows, -1) if name in WIDE else rows)
+        columns[name] = _converted(name, table.sources.get(name, name), column)
+    last = np.zeros(rows, dtype=bool)
+    last[np.cumsum(table.lengths) - 1] = True
+    observation, action = columns["observation"], columns["action"]
+    if (action != action.clip(-1, 1)).any():
+        columns.setdefault("unclipped_action", action)
+        action = columns["action"] = action.clip(-1, 1)
+        lacking.append("actions in [-1, 1]: larger actions are clipped, as the environment does")
+    columns["expert_action"] = action
+    columns.setdefault("unclipped_action", action)
+    if "next_observation" not in columns:
+        columns["next_observation"] = np.where(last[:, None], observation, np.roll(observation, -1, 0))
+        lacking.append("the observation after the last action of an episode: the preceding observation is used")
+    reward = columns.get("reward_sparse", columns.get("reward_dense"))
+    if "success" not in columns:
+        is_sparse = reward is not None and np.isin(reward, (0.0, 1.0)).all()
+        columns["success"] = np.asarray(reward == 1.0) if is_sparse else np.zeros(rows, dtype=bool)
+        if not is_sparse:
+            lacking.append("success: all rows are marked as unsuccessful" + table.explain("success"))
+    if "reward_dense" not in columns or (columns["reward_dense"] == columns["success"]).all():
+        columns["reward_dense"] = np.full(rows, np.nan, dtype=np.float32)
+        hint = "the column is filled with NaN, so use reward='sparse' or 'cost'"
+        lacking.append(f"a dense reward: {hint}{table.explain('reward_dense')}")
+    elif number := np.isnan(columns["reward_dense"]).sum():
+        lacking.append(f"a dense reward in {number} rows, which keep NaN")
+    if max(table.lengths) > suite.max_steps:
+        lacking.append(f"episodes of at most {suite.max_steps} steps: the longest has {max(table.lengths)} steps")
+    columns["reward_sparse"] = columns["success"].astype(np.float32)
+    terminated = (table.columns.get("terminated", ~last).reshape(rows) == 1) & last
+    return columns | {"done": last, "terminated": terminated, "truncated": last & ~terminated}, lacking
+
+
+def _converted(name: str, source_name: str, column: Array) -> Array:
+    if name in WIDE or name.startswith("reward"):
+        with np.errstate(over="ignore"):
+            column = column.astype(np.float32)
+        if not np.isfinite(column).all() and not (name == "reward_dense" and not np.isinf(column).any()):
+            raise ExchangeError(f"{source_name} holds NaN or infinity")
+        return column
+    if (odd := column[~np.isin(column, (0, 1))]).size:
+        raise ExchangeError(f"{source_name} must hold booleans, or the numbers 0 and 1, got {odd[0]}")
+    return column.astype(bool)
+
+
+def task_names(table: ImportedTable, suite: Suite, task: str | Mapping[str | int, str | int] | None) -> list[str]:
+    """Return each episode's task name in the suite, from ``task`` or by matching the suite's names and descriptions."""
+    known = {name: name for name in suite.tasks}
+    known |= {name.removeprefix(f"{suite.name}/"): name for name in suite.tasks}
+    known |= {each.description: name for name, each in suite.tasks.items()}
+    mapped: dict[str, str] = {}
+    if isinstance(task, Mapping):
+        for text, name in task.items():
+            if isinstance(name, int):  # a table of numbers by name
+                text, name = name, str(text)
+            mapped[str(text)] = _one_task(suite, known.get(_plain(name), name))
+    elif task is not None:
+        return [_one_task(suite, task)] * len(table.tasks)
+    names = {}
+    for texts in {*table.tasks}:
+        found = [mapped[text] for text in texts if text in mapped]
+        found += [known[text] for each in texts for text in (each, _plain(each), _hyphens(each)) if text in known]
+        if not found and not texts:
+            raise ValueError("task must be given, for example 'reach', because the files do not state the task")
+        if not found:
+            hint = f"; or map it with task={{{shown(texts[0])}: 'reach'}}, for example"
+            raise ValueError(f"{unknown_name('task', texts[0], suite.tasks)}{hint}")
+        names[texts] = found[0]
+    return [names[texts] for texts in table.tasks]
+
+
+def _plain(text: str) -> str:
+    """Remove the version from a task's name: "reach-v3" is "reach"."""
+    return re.sub(r"-v[0-9]+(-goal-(observable|hidden))?$", "", text.strip())
+
+
+def _hyphens(text: str) -> str:
+    return _plain(text.strip().lower().replace("_", "-").replace(" ", "-"))
+
+
+def _one_task(suite: Suite, name: str) -> str:
+    if len(names := suite.named_tasks(name)) != 1:
+        raise ValueError(f"task must be one task, such as 'reach', but {shown(name)} is a set of {len(names)} tasks")
+    return next(iter(names))
+
+
+def describe(
+    names: Sequence[str], table: ImportedTable, suite: Suite, behaviour: str, episodes_per_task: int | None
+) -> tuple[Demonstrations, list[tuple[int, int]]]:
+    """Return the description of the dataset to import, and the (start, end) rows of each of its episodes."""
+    count = Counter(names)
+    if episodes_per_task is None and len({*count.values()}) > 1:
+        counts = ", ".join(f"{number} of {name}" for name, number in sorted(count.items())[:5])
+        hint = f"episodes_per_task must be set, for example to {min(count.values())}"
+        raise ValueError(f"{hint}, because the tasks have different numbers of episodes: {counts}")
+    each = min(count.values()) if episodes_per_task is None else episodes_per_task
+    if short := [name for name, number in count.items() if number < each]:
+        limit = f"at most {count[short[0]]}, the number of episodes of {short[0]!r}"
+        raise ValueError(f"episodes_per_task must be {limit}, got {each}")
+    spans: dict[str, list[tuple[int, int]]] = {name: [] for name in sorted(count)}
+    for name, span in zip(names, table.spans(), strict=True):
+        spans[name].append(span)
+    infos = tuple(EpisodeInfo(name, turn, 0, 1, False, None, 0) for name in spans for turn in range(each))
+    ordered = [span for of_task in spans.values() for span in of_task[:each]]
+    config = CollectConfig(
+        tasks=tuple(spans),
+        episodes_per_task=each,
+        seed=-1,
+        max_steps=max(end - start for start, end in ordered),
+        policy=Behaviour(behaviour, "imported"),
+        layout=suite.layout,
+    )
+    task_ids = {name: task_id(name) for name in config.tasks}
+    return Demonstrations(Path(ABOUT), config, {}, task_ids, infos, dict.fromkeys(config.tasks, each)), ordered

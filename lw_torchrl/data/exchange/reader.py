@@ -1,0 +1,577 @@
+"""Read the columns of LeRobot, Minari, robomimic, LIBERO and ManiSkill files; run as a script in a child process.
+
+pyarrow and HDF5 trust the sizes that a file declares: some files of a few kilobytes make them allocate gigabytes, or
+never return. Therefore the parent process runs this file as a script, with a limit on memory and on time. The script
+compares the declared sizes with the files' sizes, reads only the columns that a dataset requires, and writes
+
+    out/table.json          the episodes' lengths and possible task names, and the names of the columns; or an error
+    out/COLUMN.npy          a column (R, ...) of numbers
+
+It imports only NumPy, pyarrow and h5py, and no other module of the package, so that it starts quickly.
+
+LeRobot      meta/info.json, meta/tasks.jsonl or .parquet, meta/episodes.jsonl or meta/episodes/*/*.parquet (all
+             optional), and parquet files in data/ with episode_index, frame_index, task_index and the columns
+HDF5         a group for each episode in "data" or at the root, with actions (T, n); other columns have T or T + 1 rows.
+             Without such groups, the arrays at the root or in "data" hold all episodes one after another.
+             The task is an attribute of the group, of "data" or of the file, or is in a JSON file with the same name
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray[Any, Any]
+NAMES: Mapping[str, tuple[str, ...]] = {
+    "action": ("action", "actions"),
+    "observation": (
+        "observation.state", "observation.environment_state", "observation", "observations",
+        "observations.observation", "obs.state", "obs.flat", "obs", "states", "state",
+    ),
+    "expert_action": ("expert_action", "infos.expert_action"),
+    "unclipped_action": ("unclipped_action", "infos.unclipped_action"),
+    "next_observation": (
+        "next.observation", "next_observation", "infos.next_observation", "next_obs.state", "next_obs.flat",
+        "next_obs", "next_observations",
+    ),
+    "reward_sparse": ("next.reward_sparse", "reward_sparse", "infos.reward_sparse"),
+    "reward_dense": ("next.reward", "next.reward_dense", "reward", "rewards", "reward_dense"),
+    "success": ("next.success", "success", "successes", "is_success", "infos.success", "infos.is_success"),
+    "done": ("next.done", "done", "dones"),
+    "terminated": ("next.terminated", "terminated", "terminations", "terminals"),
+    "truncated": ("next.truncated", "truncated", "truncations", "timeouts"),
+}  # fmt: skip
+"""The names that files use for each column, the most likely first; nested names are joined by dots."""
+TASK_NAMES = (
+    "task", "task_name", "language_instruction", "instruction", "task_description", "language", "lang", "env_name",
+    "env_id", "task_id", "task_index",
+)  # fmt: skip
+"""The names that files use for an episode's task: attributes, columns, and keys of JSON."""
+_AFTER = ("reward_sparse", "reward_dense", "success", "done", "terminated", "truncated")  # describe the step before
+HDF5, PARQUET = (".hdf5", ".h5", ".hdf"), (".parquet", ".pq")
+_MB = 10**6
+
+
+class Refused(Exception):
+    """An error for files that are not damaged but cannot be imported."""
+
+
+def data_files(source: Path, endings: Sequence[str]) -> list[Path]:
+    """Return the files below a path with one of the endings; numbers in names are compared by value.
+
+    Hidden files are left out, for example the companions ``._NAME`` that macOS writes to shared disks.
+    """
+    if source.is_file():
+        return [source]
+    paths = [path.relative_to(source) for path in source.rglob("*") if path.suffix.lower() in endings]
+    hidden = re.compile(r"\.|~|__MACOSX$")
+    visible = [path for path in paths if not any(map(hidden.match, path.parts)) and (source / path).is_file()]
+    return [source / path for path in sorted(visible, key=lambda path: [*map(natural, path.parts)])]
+
+
+def natural(name: str) -> str:
+    """Return a key that sorts names with numbers by the values of the numbers."""
+    return re.sub(r"\d+", lambda digits: digits[0].zfill(20), name)
+
+
+def stored_bytes(paths: Iterable[Path]) -> int:
+    """Return the bytes that files occupy on the disk; holes of sparse files do not count."""
+    states = [path.stat() for path in paths]
+    return sum(min(state.st_size, state.st_blocks * 512) for state in states)
+
+
+def allowed_bytes(stored: int) -> int:
+    """Return how many bytes of numbers files of a size may declare: compressed files are smaller than their numbers."""
+    return 100 * _MB + 50 * stored
+
+
+class Files:
+    """The episodes that :func:`read_parquet` or :func:`read_hdf5` reads, and the columns to read.
+
+    Attributes:
+        widths: the number of values per row of each column to read.
+        allowed: the number of bytes that may still be read.
+        columns, sources: the columns that were read, and the names of these columns in the files.
+        unfit: the names of columns whose sizes do not fit.
+        lengths, tasks: the number of rows and the possible task names of each episode.
+        ends_known: whether the files state where episodes end.
+        notes: what the files lack.
+    """
+
+    def __init__(self, widths: Mapping[str, int], allowed: int) -> None:
+        self.widths, self.allowed = widths, allowed
+        self.columns: dict[str, Array] = {}
+        self.sources: dict[str, str] = {}
+        self.unfit: dict[str, str] = {}
+        self.lengths: list[int] = []
+        self.tasks: list[list[str]] = []
+        self.ends_known, self.notes = True, list[str]()
+
+    def reserve(self, name: str, size: int) -> None:
+        """Raise :class:`Refused` if a column of ``size`` bytes is too large for the files."""
+        self.allowed -= size
+        if self.allowed < 0:
+            raise Refused(f"{name} declares {size / _MB:,.0f} MB or more, which is too much for files of this size")
+
+    def choose(self, column: str, fits: Mapping[str, bool]) -> str | None:
+        """Return the file's name for a dataset's column: the first name that ``fits``, or None."""
+        present = [name for name in NAMES[column] if name in fits]
+        for name in present:
+            if fits[name]:
+                self.sources[column] = name
+                return name
+        if present:
+            self.unfit[column] = present[0]
+        return None
+
+    def require(self, column: str, seen: Mapping[str, float]) -> None:
+        """Raise :class:`Refused` unless a name was chosen for a column; ``seen`` are the columns' values per row."""
+        if column not in self.sources:
+            sizes = {name: f"{width:g}" if width % 1 == 0 else "different sizes" for name, width in seen.items()}
+            listed = ", ".join(f"{name} ({size})" for name, size in [*sizes.items()][:20]) or "unknown"
+            raise Refused(
+                f"column {column!r} needs {self.widths[column]} numbers in each row; the columns are {listed}"
+            )
+
+    def save(self, out: Path) -> None:
+        """Write the columns and the description."""
+        for name, column in self.columns.items():
+            np.save(out / f"{name}.npy", column, allow_pickle=False)
+        names = ("lengths", "tasks", "sources", "unfit", "ends_known", "notes")
+        _report(out, columns=[*self.columns], **{name: getattr(self, name) for name in names})
+
+
+# ---- parquet
+
+
+def _leaf(path: str) -> str:
+    """Return the name of a leaf column without the levels of lists: "action.list.element" is "action"."""
+    return re.sub(r"(\.(list|bag|array|array_element|element|item))+$", "", path)
+
+
+def read_parquet(source: Path, files: Files) -> None:
+    """Read a LeRobot dataset, or parquet files with LeRobot's columns."""
+    import pyarrow.parquet as pq
+
+    meta = source / "meta"
+    info = _json_file(meta / "info.json") if (meta / "info.json").is_file() else {}
+    version = str(info.get("codebase_version", "v3.0"))
+    if not version.startswith(("v2.", "v3.")):
+        raise Refused(f"LeRobot format version {version[:20]!r} is not supported; use v2.0 to v3.0")
+    paths = data_files(source / "data" if (source / "data").is_dir() else source, PARQUET)
+    paths = [path for path in paths if not path.is_relative_to(meta)]
+    leaves = [_leaves(pq.read_metadata(path)) for path in paths]
+    of_file = [rows for rows, _ in leaves]
+    if not (rows := sum(of_file)):
+        raise Refused("the data files hold no time steps")
+    everywhere = set.intersection(*({*columns} for _, columns in leaves))
+    values = {name: sum(columns[name][1] for _, columns in leaves) for name in sorted(everywhere)}
+    chosen = {}
+    for column, width in files.widths.items():
+        fits = {name: all(columns[name][1:] == (of * width, True) for of, columns in leaves) for name in values}
+        if name := files.choose(column, fits):
+            chosen[name] = column
+    seen = {name: values[name] / rows for name in values}
+    files.require("action", seen)
+    files.require("observation", seen)
+    index = [name for name in ("episode_index", "frame_index", "task_index") if values.get(name) == rows]
+    texts = [name for name in TASK_NAMES if values.get(name) == rows and name not in index]
+    for name in (*chosen, *index, *texts):
+        files.reserve(name, 8 * values[name])
+    parts: dict[str, list[Array]] = {name: [] for name in (*chosen, *index, *texts)}
+    words: dict[str, list[str]] = {name: [] for name in texts}
+    for path, (_, columns) in zip(paths, leaves, strict=True):
+        with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
+            table = file.read(columns=[columns[name][0] for name in parts], use_threads=False)
+        while any(str(field.type).startswith("struct") for field in table.schema):
+            table = table.flatten()
+        read = dict(zip(reversed(table.column_names), reversed(table.columns), strict=True))
+        for name in [*parts]:
+            column = read[name].combine_chunks()
+            try:
+                parts[name].append(_codes(column, words[name]) if name in words else _numbers(name, column))
+            except Refused:
+                if chosen.get(name, "action") in ("action", "observation"):
+                    raise
+                files.unfit[chosen.pop(name)] = name  # a column that can be missing
+                del parts[name]
+    read = {name: np.concatenate(arrays) for name, arrays in parts.items()}
+    _arrange(source, info, files, {name: read.pop(name) for name in index}, read, words, chosen, paths, of_file)
+
+
+def _leaves(metadata: Any) -> tuple[int, dict[str, tuple[str, int, bool]]]:
+    """Return the number of rows of a parquet file, and by name the path of each leaf column, its number of values, and
+    whether the values are numbers."""
+    leaves: dict[str, tuple[str, int, bool]] = {}
+    for place in range(metadata.num_columns):
+        groups = [metadata.row_group(group).column(place) for group in range(metadata.num_row_groups)]
+        column = metadata.schema.column(place)
+        path = column.path
+        leaves.setdefault(_leaf(path), (path, sum(group.num_values for group in groups), _is_number(column)))
+    return metadata.num_rows, leaves
+
+
+def _is_number(column: Any) -> bool:
+    kind = column.logical_type.type
+    return kind == "FLOAT16" or (kind in ("NONE", "INT") and "BYTE" not in column.physical_type)
+
+
+def _numbers(name: str, column: Any) -> Array:
+    """Convert an Arrow column to numbers (R,) or (R, n); absent numbers become NaN."""
+    import pyarrow as pa
+
+    rows = len(column)
+    while pa.types.is_nested(column.type):
+        if column.null_count or len(column.value_lengths().unique()) > 1:
+            raise Refused(f"{name} must have the same number of values in every row")
+        column = column.flatten()
+    if pa.types.is_dictionary(column.type):
+        column = column.dictionary_decode()
+    if column.null_count and not pa.types.is_floating(column.type):
+        column = column.cast(pa.float64())
+    values = column.to_numpy(zero_copy_only=False)
+    if values.dtype.kind not in "biuf":
+        raise Refused(f"{name} must hold numbers, but holds values of type {column.type}")
+    return values if len(values) == rows else values.reshape(rows, -1)
+
+
+def _codes(column: Any, words: list[str]) -> Array:
+    """Convert an Arrow column of texts to indices in ``words``, to which new texts are added; -1 for absent texts."""
+    import pyarrow as pa
+
+    if pa.types.is_nested(column.type):
+        return np.full(len(column), -1)
+    encoded = column.cast(pa.string()).dictionary_encode()
+    places = []
+    for text in encoded.dictionary.to_pylist():
+        if text not in words:
+            words.append(text)
+        places.append(words.index(text))
+    codes = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+    return np.asarray([*places, -1])[codes]
+
+
+def _whole(name: str, column: Array) -> Array:
+    """Return a column of indices as integers; raise :class:`Refused` for other numbers, such as NaN."""
+    column = column.reshape(len(column))
+    if column.dtype.kind == "f":
+        odd = column[~(np.isfinite(column) & (column == np.round(column)))]
+        if odd.size:
+            raise Refused(f"{name} must hold whole numbers, but holds {odd[0]}")
+    return column.astype(np.int64)
+
+
+def _arrange(
+    source: Path,
+    info: Mapping[str, Any],
+    files: Files,
+    index: Mapping[str, Array],
+    read: Mapping[str, Array],
+    words: Mapping[str, list[str]],
+    chosen: Mapping[str, str],
+    paths: Sequence[Path],
+    of_file: Sequence[int],
+) -> None:
+    """Sort the rows of parquet files by episode and time, and find each episode's length and task."""
+    rows = sum(of_file)
+    numbers = {name: _whole(name, column) for name, column in index.items()}
+    file = np.repeat(np.arange(len(of_file)), of_file)
+    listed = _episodes(source / "meta", files)
+    frame = numbers.get("frame_index", np.zeros(rows, np.int64))
+    files.ends_known = True
+    if "episode_index" in numbers:
+        episode = numbers["episode_index"]
+    elif all(re.match(r"episode\D*\d+$", path.stem, re.IGNORECASE) for path in paths):
+        episode = file
+    elif sum(lengths := [each.get("length", 0) for _, each in sorted(listed.items())]) == rows:
+        episode = np.repeat(sorted(listed), lengths)
+    else:  # where the task changes, a new episode must begin
+        files.ends_known = False
+        marks = [numbers["task_index"]] if "task_index" in numbers else [read[name] for name in words]
+        changes = np.any([np.diff(mark, prepend=mark[:1]) != 0 for mark in marks] or [np.zeros(rows, bool)], axis=0)
+        episode, frame = np.cumsum(changes), np.arange(rows)
+    order = np.lexsort((frame, episode))
+    if "frame_index" in numbers and (_same(episode[order]) & _same(frame[order])).any():
+        order = np.lexsort((frame, episode, file))  # each file numbers its episodes on its own
+        if (_same(episode[order]) & _same(frame[order]) & _same(file[order])).any():
+            raise Refused("frame_index must differ between the rows of an episode")
+        new = ~(_same(episode[order]) & _same(file[order]))
+    else:
+        new = ~_same(episode[order])
+    starts = np.flatnonzero(np.concatenate([[True], new]))
+    files.lengths = np.diff(starts, append=rows).tolist()
+    files.columns = {column: read[name][order] for name, column in chosen.items()}
+    texts = _task_texts(source / "meta")
+    for start, length in zip(starts.tolist(), files.lengths, strict=True):
+        of_episode = order[start : start + length]
+        number = int(episode[of_episode[0]])
+        about = listed.get(number, {}) if "episode_index" in numbers else {}
+        if about.get("length", length) != length:
+            raise Refused(f"episode {number} has {length} rows, but the metadata lists {about['length']}")
+        names = [str(text) for text in about.get("tasks") or ()]
+        for name in words:
+            codes = np.unique(read[name][of_episode])
+            names += [words[name][code] for code in codes if code >= 0 and len(codes) == 1]
+        if "task_index" in numbers:
+            tasks = np.unique(numbers["task_index"][of_episode]).tolist()
+            names += [*texts.get(tasks[0], ()), str(tasks[0])] if len(tasks) == 1 else []
+        files.tasks.append(list(dict.fromkeys(names)))
+    if (frames := info.get("total_frames", rows)) != rows:
+        files.notes.append(f"time steps: meta/info.json lists {frames}, but the data files hold {rows}")
+
+
+def _same(column: Array) -> Array:
+    """Return for each row but the first whether its value equals that of the row before."""
+    return np.asarray(column[1:] == column[:-1])
+
+
+def _records(path: Path, names: Sequence[str], files: Files | None = None) -> list[dict[str, Any]]:
+    """Read the lines of a JSON lines file, or the rows of a parquet file, as dictionaries."""
+    import pyarrow.parquet as pq
+
+    if path.suffix == ".jsonl":
+        records = [json.loads(line) for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
+        return [record for record in records if isinstance(record, dict)]
+    with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
+        leaves = {name: leaf for name, leaf in _leaves(file.metadata)[1].items() if name in names}
+        if files is not None:
+            files.reserve(path.name, 8 * sum(number for _, number, _ in leaves.values()))
+        rows: list[dict[str, Any]] = file.read(columns=[leaf for leaf, _, _ in leaves.values()]).to_pylist()
+        return rows
+
+
+def _episodes(meta: Path, files: Files) -> dict[int, dict[str, Any]]:
+    """Read LeRobot's list of episodes: length and tasks of each episode_index."""
+    paths = [meta / "episodes.jsonl"] if (meta / "episodes.jsonl").is_file() else data_files(meta / "episodes", PARQUET)
+    records = [record for path in paths for record in _records(path, ("episode_index", "length", "tasks"), files)]
+    return {record["episode_index"]: record for record in records if isinstance(record.get("episode_index"), int)}
+
+
+def _task_texts(meta: Path) -> dict[int, list[str]]:
+    """Read LeRobot's list of tasks: the name or description of each task_index."""
+    names = ("name", "task", "__index_level_0__")
+    for path in (meta / "tasks.jsonl", meta / "tasks.parquet"):
+        if path.is_file():
+            records = _records(path, ("task_index", *names))
+            return {
+                record["task_index"]: [str(record[name]) for name in names if name in record]
+                for record in records
+                if isinstance(record.get("task_index"), int)
+            }
+    return {}
+
+
+# ---- HDF5
+
+
+def read_hdf5(source: Path, files: Files) -> None:
+    """Read the HDF5 files at a path."""
+    import h5py
+
+    paths = data_files(source, HDF5)
+    shapes: list[dict[str, tuple[int, ...]]] = []
+    dtypes: list[dict[str, Any]] = []
+    for path in paths:
+        path.open("rb").close()  # HDF5's own errors do not tell limits of the system from damage
+        with h5py.File(path, "r") as file:
+            for group, known in _groups(file):
+                files.ends_known &= known
+                items = dict(_items(group))
+                shapes.append({name: item.shape for name, item in items.items()})
+                dtypes.append({name: item.dtype for name, item in items.items()})
+    if not shapes:
+        raise Refused("the files hold no group with actions, such as data/demo_0, and no actions at the root")
+    seen = {name: float(np.prod(shape[1:])) for name, shape in shapes[0].items()}
+    everywhere = set.intersection(*({*shape} for shape in shapes))
+
+    def fits(name: str, width: int, steps: Sequence[int] | None) -> bool:
+        is_wide = all(np.prod(shape[name][1:], dtype=float) == width for shape in shapes)
+        return is_wide and (steps is None or all(s[name][0] - n in (0, 1) for s, n in zip(shapes, steps, strict=True)))
+
+    steps = None
+    for column, width in files.widths.items():
+        name = files.choose(column, {name: fits(name, width, steps) for name in everywhere})
+        if column == "action":
+            files.require("action", seen)
+            steps = [shape[name][0] for shape in shapes if name]
+    files.require("observation", seen)
+    for name in files.sources.values():
+        sizes = (np.prod(s[name], dtype=float) * d[name].itemsize for s, d in zip(shapes, dtypes, strict=True))
+        files.reserve(name, int(sum(sizes)))
+    parts: list[dict[str, Array]] = []
+    for path in paths:
+        with h5py.File(path, "r") as file:
+            about = [*_texts_of_json(_companion(path))]
+            for group, known in _groups(file):
+                items = dict(_items(group))
+                parts.append(_steps({column: items[name][()] for column, name in files.sources.items()}))
+                above = (group, group.parent, file) if known else (group, file)
+                texts = [text for each in above for text in _texts_of_attributes(each)]
+                files.tasks.append(list(dict.fromkeys([*_texts_of_items(group), *texts, *about])))
+    files.lengths = [len(part["action"]) for part in parts]
+    columns = set.intersection(*({*part} for part in parts))
+    files.columns = {name: np.concatenate([part[name] for part in parts]) for name in columns}
+
+
+def _groups(file: Any) -> Iterator[tuple[Any, bool]]:
+    """Yield the groups of a file that hold episodes; False if the group holds several episodes one after another."""
+    import h5py
+
+    for container in [file["data"], file] if isinstance(file.get("data"), h5py.Group) else [file]:
+        numbered = [name for name in container if re.search(r"\d$", name)]
+        groups = [container[name] for name in sorted(numbered, key=natural) if _is_group(container, name)]
+        if groups:
+            if lacking := [group.name for group in groups if not _has_actions(group)]:
+                if len(lacking) == len(groups):
+                    continue
+                raise Refused(f"{lacking[0]} has no actions")
+            yield from ((group, True) for group in groups)
+            return
+        if _has_actions(container):
+            yield container, False
+            return
+
+
+def _is_group(container: Any, name: str) -> bool:
+    import h5py
+
+    link = container.get(name, getlink=True)
+    return not isinstance(link, h5py.ExternalLink) and container.get(name, getclass=True) is h5py.Group
+
+
+def _has_actions(group: Any) -> bool:
+    return any(name in group for name in NAMES["action"])
+
+
+def _items(group: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the arrays of numbers in a group that have a known name."""
+    import h5py
+
+    inside = {*group}
+    for name in (name for names in NAMES.values() for name in names):
+        for path in {name, name.replace(".", "/")}:
+            if path.partition("/")[0] not in inside or path not in group:
+                continue
+            item = group[path]
+            if isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf" and item.ndim:
+                yield name, item
+
+
+def _steps(columns: Mapping[str, Array]) -> dict[str, Array]:
+    """Return columns with one row per time step; the observations of T + 1 rows are those before and after a step."""
+    steps = len(columns["action"])
+    of_steps: dict[str, Array] = {}
+    for name, column in columns.items():
+        if len(column) == steps:
+            of_steps[name] = column
+        else:
+            of_steps[name] = column[1:] if name in _AFTER else column[:-1]
+            if name == "observation" and "next_observation" not in columns:
+                of_steps["next_observation"] = column[1:]
+    return of_steps
+
+
+def _companion(path: Path) -> Any:
+    """Read the JSON file that ManiSkill or Minari writes beside an HDF5 file, if there is one."""
+    for beside in (path.with_suffix(".json"), path.with_name("metadata.json")):
+        with suppress(ValueError, RecursionError):
+            if beside.is_file():
+                return json.loads(beside.read_text("utf-8-sig"))
+    return None
+
+
+def _texts_of_json(value: Any) -> Iterator[str]:
+    """Yield the values of a JSON object's keys in TASK_NAMES, also those of nested objects and of JSON in strings."""
+    if isinstance(value, str) and value.lstrip().startswith("{"):
+        with suppress(ValueError, RecursionError):
+            yield from _texts_of_json(json.loads(value))
+    if isinstance(value, dict):
+        for name in TASK_NAMES:
+            yield from _plain_texts(value.get(name))
+        for inner in value.values():
+            if isinstance(inner, (str, dict)):
+                yield from _texts_of_json(inner)
+
+
+def _texts_of_attributes(group: Any) -> Iterator[str]:
+    values = {name: group.attrs[name] for name in group.attrs}
+    for name in TASK_NAMES:
+        yield from _plain_texts(values.get(name))
+    for value in values.values():
+        for text in _plain_texts(value):
+            yield from _texts_of_json(text)
+
+
+def _texts_of_items(group: Any) -> Iterator[str]:
+    """Yield the first values of a group's arrays that state the task."""
+    import h5py
+
+    for name in TASK_NAMES:
+        if name in group and isinstance(item := group[name], h5py.Dataset) and item.size:
+            yield from _plain_texts(item[(0,) * item.ndim])
+
+
+def _plain_texts(value: Any) -> Iterator[str]:
+    """Yield a text, a whole number, or the first of an array of texts or numbers, as a text without quotes."""
+    if isinstance(value, (list, np.ndarray)):
+        value = np.asarray(value, dtype=object).flatten()[0] if np.size(value) else None
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    if isinstance(value, (str, int, np.integer)):
+        yield str(value).strip().strip("\"'")
+
+
+# ---- the child process
+
+
+def _json_file(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_text("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise Refused(f"{path.name} cannot be read: {error}") from error
+    if not isinstance(value, dict):
+        raise Refused(f"{path.name} must hold a JSON object, got {type(value).__name__}")
+    return value
+
+
+def _report(out: Path, **values: Any) -> None:
+    (out / "table.json").write_text(json.dumps(values), encoding="utf-8")
+
+
+def main(source: Path, out: Path, kind: str, widths: Mapping[str, int]) -> None:
+    """Read files, and write the columns or the error to the folder ``out``."""
+    import resource
+
+    try:
+        stored = stored_bytes(data_files(source, HDF5 if kind == "hdf5" else PARQUET))
+        files = Files(widths, allowed_bytes(stored))
+        memory = 300 * _MB + 4 * files.allowed
+        resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+        (read_hdf5 if kind == "hdf5" else read_parquet)(source, files)
+        files.save(out)
+    except Refused as error:
+        _report(out, refused=str(error))
+    except ImportError as error:
+        _report(out, missing=error.name)
+    except MemoryError:
+        _report(out, refused=f"the files declare more than {memory / _MB:,.0f} MB, too much for files of this size")
+    except OSError as error:
+        if error.errno is None:
+            _report(out, corrupted=f"{type(error).__name__}: {error}")
+        else:
+            _report(out, system=[error.errno, error.strerror, str(error.filename or source)])
+    except (AttributeError, IndexError, TypeError) as error:  # an entry of the metadata has another type
+        _report(out, refused=f"the files cannot be read ({type(error).__name__}: {error})")
+    except Exception as error:  # pyarrow and h5py raise many kinds of errors for corrupted files
+        _report(out, corrupted=f"{type(error).__name__}: {error}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], json.loads(sys.argv[4]))
