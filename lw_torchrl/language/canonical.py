@@ -18,7 +18,7 @@ from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import STATES, comparisons
 from lw_torchrl.language.roles import BY_HAND, VECTORS, Direction, Manner, StepRole, Verb, motion_of
-from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, parse_steps
+from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, is_held, parse_steps
 from lw_torchrl.language.tasks import (
     Task,
     first_object,
@@ -133,6 +133,8 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     if confidence >= MIN_CONFIDENCE and _is_complete(read):
         source, steps = "plan", read
     elif motion is not None:
+        has_wall = any("wall" in name.split() for name in task.object_names)  # lift the object over the wall
+        motion = replace(motion, verb="carry") if motion.verb == "move" and has_wall else motion
         source, steps = "completed", _completed(task, read, motion)
     else:
         source, steps = "fallback", fallback_plan(task).steps
@@ -253,12 +255,11 @@ def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
     for number, step in enumerate(steps):
         role = _role(step)
         later = (_role(other) for other in steps[number + 1 :])
-        after = next((other for other in later if other.verb in ("carry", "move")), None)
+        moving = (other for other in later if other.verb in ("carry", "move"))
+        after = next((other for other in moving if not same_object(task, role.target, other.target)), None)
         is_fixed = not any(isinstance(at, int) for at in role_object(task, role.target).position)
-        if role.verb != "carry" or not is_fixed or after is None or same_object(task, role.target, after.target):
-            continue
-        if same_object(task, role.moved, after.moved):
-            direct[number] = _step(step.condition, replace(role, moved=after.moved, target=after.target))
+        if role.verb in ("carry", "move") and is_fixed and after and same_object(task, role.moved, after.moved):
+            direct[number] = _step(step.condition, replace(role, verb="carry", moved=after.moved, target=after.target))
     return direct
 
 
@@ -291,18 +292,19 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
 
     # Complete a pull as a grasp, which also holds objects that the fingers cannot hook.
     if motion.manner in ("grasp", "pull"):
-        held = object_of(task, point)
+        moved = object_of(task, point)
         if motion.verb == "pull":
             way = motion.direction if motion.direction in VECTORS else None
-            goal = held if way else GOAL
-            motion = replace(motion, verb="move", manner="grasp", moved=held, target=goal, direction=way)
+            goal = moved if way else GOAL
+            motion = replace(motion, verb="move", manner="grasp", moved=moved, target=goal, direction=way)
         elif motion.moved == GRIPPER:
-            motion = replace(motion, moved=held)
+            motion = replace(motion, moved=moved)
+        held = Query((*near.clauses, *_gripper_is("closed").clauses))
         return (
             by_hand("approach", "grasp", _negated(above), away),
             by_hand("descend", "grasp", above, away),
             by_hand("close", "grasp", near, _gripper_is("open")),
-            _step(Query((*near.clauses, *_gripper_is("closed").clauses)), motion),
+            *(_own_motions(task, steps, held, point) or [_step(held, motion)]),
         )
     way, motion = motion.direction, replace(motion, target=point)
     if motion.manner == "press":
@@ -312,6 +314,18 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
         return by_hand("beside", "push", _negated(level), way=way), _step(level, motion)
     approach = by_hand("approach", "push", _negated(over), way=way), by_hand("beside", "push", over, away, way=way)
     return *approach, _step(near, motion)
+
+
+def _own_motions(task: Task, steps: Sequence[PlanStep], held: Query, point: str) -> list[PlanStep]:
+    """Return the plan's own motions of held objects, each while the object is held, if there are several."""
+    moving = [step for step in steps if _role(step).verb in ("carry", "move") and is_held(step)]
+    if len({(_role(step).moved, _role(step).target, _role(step).direction) for step in moving}) < 2:
+        return []
+    own = []
+    for step in moving:
+        clauses = tuple(clause for clause in step.condition.clauses if GRIPPER not in (clause.subject, clause.object))
+        own.append(_step(Query((*held.clauses, *clauses)), _role(step)))
+    return own
 
 
 def _touched(task: Task, roles: Sequence[StepRole]) -> str:

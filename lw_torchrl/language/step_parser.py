@@ -64,6 +64,12 @@ class _Facts:
         return cls(near=compared_with_gripper(step), **facts)
 
 
+def is_held(step: PlanStep) -> bool:
+    """Return whether a step's condition states that the closed gripper is at an object."""
+    facts = _Facts.of(step)
+    return facts.closed and facts.at and not facts.open
+
+
 def parse_steps(plan: ConditionalPlan) -> tuple[ParsedStep | None, ...]:
     """Parse each step of a plan; a step that cannot be parsed becomes None."""
     task = plan.definition
@@ -118,9 +124,17 @@ def _only_sent(step: ParsedStep | None, text: str) -> ParsedStep | None:
     return replace(step, verb="reach") if step and goes_to else step
 
 
+def _is_fist(text: str, facts: _Facts) -> bool:
+    """Return whether "close the gripper" closes it before it is at an object, to push with closed fingers."""
+    is_bare = text.startswith("close ") and "<" not in text.replace(f"<{GRIPPER}>", "")
+    return is_bare and bool(facts.near) and not facts.at
+
+
 def _grasps(text: str, facts: _Facts) -> bool:
     """Return whether a step grasps or carries an object, or has the condition of a closed gripper at an object."""
     verb, *rest = text.split()
+    if _is_fist(text, facts):
+        return False
     if verb in _VERBS["held"] and rest and rest[0].startswith("<") and not text.startswith(f"{verb} <{GRIPPER}>"):
         return True
     return (verb in _VERBS["close"] and (verb != "close" or GRIPPER in text)) or (facts.closed and facts.at)
@@ -180,6 +194,8 @@ class _StepParser:
         opens = self.verb in _VERBS["open"] and GRIPPER in self.text and not self.words & {"around", "onto", "on"}
         if opens or self.verb == "release":
             return ParsedStep("open", GRIPPER, noun)
+        if _is_fist(self.text, self.facts) and not self.grasping:
+            return ParsedStep("approach", GRIPPER, noun, confidence=0.5)
         if self.verb in _VERBS["close"] and (self.verb != "close" or GRIPPER in self.text or self.grasping):
             return self._closed(noun)
         return self._by_hand() if self.by_hand else self._object_moved(noun)
