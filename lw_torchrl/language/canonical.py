@@ -18,7 +18,7 @@ from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import STATES, comparisons
 from lw_torchrl.language.roles import BY_HAND, VECTORS, Direction, Manner, StepRole, Verb, motion_of
-from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, is_held, parse_steps
+from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, is_held, is_obstacle, parse_steps
 from lw_torchrl.language.tasks import (
     Task,
     first_object,
@@ -133,8 +133,6 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     if confidence >= MIN_CONFIDENCE and _is_complete(read):
         source, steps = "plan", read
     elif motion is not None:
-        has_wall = any("wall" in name.split() for name in task.object_names)  # lift the object over the wall
-        motion = replace(motion, verb="carry") if motion.verb == "move" and has_wall else motion
         source, steps = "completed", _completed(task, read, motion)
     else:
         source, steps = "fallback", fallback_plan(task).steps
@@ -299,6 +297,8 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
             motion = replace(motion, verb="move", manner="grasp", moved=moved, target=goal, direction=way)
         elif motion.moved == GRIPPER:
             motion = replace(motion, moved=moved)
+        if motion.verb == "move" and steps and any(map(is_obstacle, task.object_names)):
+            motion = replace(motion, verb="carry")
         held = Query((*near.clauses, *_gripper_is("closed").clauses))
         return (
             by_hand("approach", "grasp", _negated(above), away),

@@ -70,6 +70,11 @@ def is_held(step: PlanStep) -> bool:
     return facts.closed and facts.at and not facts.open
 
 
+def is_obstacle(name: str) -> bool:
+    """Return whether an object is named as something to move over or around."""
+    return "wall" in name.split()
+
+
 def parse_steps(plan: ConditionalPlan) -> tuple[ParsedStep | None, ...]:
     """Parse each step of a plan; a step that cannot be parsed becomes None."""
     task = plan.definition
@@ -236,6 +241,8 @@ class _StepParser:
 
     def _object_moved(self, noun: str) -> ParsedStep:
         """Parse a step that moves an object."""
+        if is_obstacle(noun) and not self.grasping:  # "move forward over the wall"
+            return ParsedStep("approach", GRIPPER, noun)
         target = self._target(noun)
         moved = self.tool if self.tool is not None and (target is None or not is_goal(self.task, target)) else noun
         if target is not None:
