@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import read_toml
+from lw_torchrl.language.expressions import evaluate, leaves, negate, replace_leaves
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import GOAL, GRIPPER, Coordinate
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
@@ -179,7 +180,7 @@ def _gripper_is(predicate: str, name: str | None = None) -> Query:
 
 
 def _negated(query: Query) -> Query:
-    return Query(tuple(replace(clause, negated=not clause.negated) for clause in query.clauses))
+    return Query(negate(query.expression))
 
 
 def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> tuple[PlanStep, ...]:
@@ -244,7 +245,9 @@ def _at_points(condition: Query, task: Task) -> Query:
             return clause
         return replace(clause, subject=at(clause.subject), object=at(clause.object))
 
-    return Query(tuple(map(touched, condition.clauses)))
+    if condition.is_conjunction:
+        return Query(tuple(map(touched, condition.clauses)))
+    return Query(replace_leaves(condition.expression, touched))
 
 
 def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
@@ -373,7 +376,7 @@ def _coverage(task: Task, point: str, motion: str, steps: Sequence[tuple[Query, 
     good = 0
     for offset, opening, lift, verbs in _TYPICAL[motion]:
         state = _state(task, point, offset, opening, lift)
-        active = {verb for query, verb in steps if all(_is_true(clause, task, state) for clause in query.clauses)}
+        active = {verb for query, verb in steps if _holds(query, task, state)}
         good += bool(active) and active <= verbs
     return good / len(_TYPICAL[motion])
 
@@ -400,6 +403,12 @@ def _floats(numbers: Sequence[float]) -> _Floats:
 def _position(position: Sequence[Coordinate], state: _Floats) -> _Floats:
     """Return a position (3,) in a state, in metres."""
     return _floats([state[at] if isinstance(at, int) else at for at in position])
+
+
+def _holds(query: Query, task: Task, state: _Floats) -> bool:
+    if query.is_conjunction:  # much faster, since it ends at the first clause that is false
+        return all(_is_true(clause, task, state) for clause in query.clauses)
+    return evaluate(query.expression, {leaf: _is_true(leaf, task, state) for leaf in leaves(query.expression)})
 
 
 def _is_true(clause: Clause, task: Task, state: _Floats) -> bool:

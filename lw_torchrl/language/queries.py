@@ -3,14 +3,30 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from itertools import permutations
 
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._util.checks import typed
+from lw_torchrl.language.connectives import CONNECTIVES, OPENERS, parse_words
+from lw_torchrl.language.expressions import (
+    FALSE,
+    TRUE,
+    Expression,
+    all_of,
+    as_expression,
+    count_mentions,
+    implied,
+    leaves,
+    literals,
+    negate,
+    replace_leaves,
+    write,
+)
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, STATES, TOUCHING, UNARY
@@ -18,7 +34,8 @@ from lw_torchrl.language.tasks import Task, get_task
 
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
-_MOST_CLAUSES = 64  # per query; the query tables are padded to the longest query
+_OTHERS = frozenset(("(", *CONNECTIVES)) - {"and"}
+_MOST_CLAUSES = 256  # in the text of a query
 
 
 @dataclass(frozen=True)
@@ -35,29 +52,96 @@ class Clause:
         return words if self.object is None else f"{words} the {self.object}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Query:
-    """A conjunction of clauses, which is true if every clause is true. ``str(query)`` is the canonical spelling.
+    """A condition: a boolean expression over clauses. ``str(query)`` is the canonical spelling.
+
+    Queries are equal if their expressions have the same normal form. A conjunction is spelled as it was given, with
+    repeated clauses.
+
+    Args:
+        expression: an expression over clauses (:mod:`lw_torchrl.language.expressions`); or a tuple of clauses that must
+            all be true.
 
     Example:
         >>> str(parse_query("Is the gripper open and not above the puck?", task="pick-place"))
         "the robot's gripper is open and the robot's gripper is not above the puck"
+        >>> print(parse_query("either the gripper is open or the puck is not near the target location", task="push"))
+        the robot's gripper is open or the puck is not near the target location
     """
 
-    clauses: tuple[Clause, ...]
+    expression: Expression
+    _given: tuple[Clause, ...] = field(default=(), init=False, compare=False, repr=False)
+
+    def __init__(self, expression: Expression | tuple[Clause, ...]) -> None:
+        if not isinstance(expression, Expression):
+            object.__setattr__(self, "_given", tuple(expression))
+            expression = all_of(map(_without_negation, expression))
+        elif any(clause.negated for clause in leaves(expression)):
+            expression = replace_leaves(expression, _without_negation)
+        object.__setattr__(self, "expression", expression)
 
     def __str__(self) -> str:
-        return " and ".join(map(str, self.clauses))
+        if self._given:
+            return " and ".join(map(str, self._given))
+        return write(self.expression, lambda clause, negated: str(replace(clause, negated=negated)))
+
+    @property
+    def is_conjunction(self) -> bool:
+        """True for a clause or a conjunction of clauses: a query without "or"."""
+        if self._given:
+            return True
+        return self.expression.kind != "any" and all(part.kind == "leaf" for part in self.expression.parts)
+
+    @cached_property
+    def clauses(self) -> tuple[Clause, ...]:
+        """The clauses that the query mentions, in order; for a conjunction, the clauses that must all be true."""
+        return self._given or tuple(map(_as_clause, literals(self.expression)))
+
+    @cached_property
+    def implied(self) -> tuple[Clause, ...]:
+        """The clauses that are true wherever the query is true, as far as its form shows."""
+        return self._given or tuple(map(_as_clause, implied(self.expression)))
+
+
+def _without_negation(clause: Clause) -> Expression:
+    return negate(replace(clause, negated=False)) if clause.negated else as_expression(clause)
+
+
+def _as_clause(literal: Expression) -> Clause:
+    return replace(literal.leaf, negated=True) if literal.negated else literal.leaf
 
 
 class QueryError(ValueError):
     """The error for a text that is not a query about the objects of its task."""
 
 
-def check_length(text: str, parts: Sequence[str]) -> None:
-    """Raise a QueryError if a text has more clauses than a query may have."""
-    if len(parts) > _MOST_CLAUSES:
-        raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {len(parts)}")
+def split_words(text: str) -> list[str]:
+    """Split a text into words and parentheses. "not above or near the puck" becomes "not (above the puck or near the
+    puck)".
+
+    Raises:
+        QueryError: the text has more clauses or groups than a query may have.
+    """
+    words = re.findall(r"[()]|[^\s()]+", text)
+    joins = Counter(map(str.casefold, words))
+    clauses = 1 + sum(joins[word] for word in ("and", "or", "nor", "unless"))
+    groups = sum(joins[word] for word in OPENERS)
+    for number, counted in ((clauses, "clauses"), (groups, "parentheses")):
+        if number > _MOST_CLAUSES:
+            raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} {counted}, got {number}")
+    spaced, pattern = " ".join(words), _two_relations(tuple(RELATIONS))
+    if pattern.search(spaced) is None:
+        return words
+    return re.findall(r"[()]|[^\s()]+", pattern.sub(r"(\1 \4 \2 \3 \4)", spaced))
+
+
+@lru_cache(maxsize=16)
+def _two_relations(names: tuple[str, ...]) -> re.Pattern[str]:
+    """Compile a pattern that matches two relations to one object."""
+    relation = "|".join(map(re.escape, sorted(names, key=len, reverse=True)))
+    word = r"(?!(?:and|or|nor|unless|is|isn't)\b)[^\s()]+"
+    return re.compile(rf"\b({relation}) (and|or) ({relation}) ({word}(?: {word})*)", re.IGNORECASE)
 
 
 @lru_cache(maxsize=256)
@@ -150,9 +234,12 @@ class _ClauseParser:
         if not self.words:
             raise self.error("a condition")
         negated = self.take("isn't")
-        if not negated:
+        denied = not negated and self.take("not")  # "not the gripper is open"
+        if not negated and not denied:
             self.take("is")
         subject = self.name()
+        if subject is None and denied:
+            self.at, denied = 0, False
         if subject is None:
             if previous is None or self.at_article():
                 raise self.name_error()
@@ -174,8 +261,8 @@ class _ClauseParser:
             self.at = start
             raise self.name_error(f"an object other than {subject!r}")
         if self.at < len(self.words):
-            raise self.error("the end of the clause, or 'and'")
-        return Clause(subject, predicate, other, negated)
+            raise self.error("the end of the clause, 'and' or 'or'")
+        return Clause(subject, predicate, other, negated != denied)
 
 
 @typed
@@ -185,8 +272,12 @@ def parse_query(text: str, task: str | Task) -> Query:
     The text may be a question, use capitals, omit articles, and contain "the gripper" or "isn't". A clause may omit its
     subject if the previous clause has the same subject ("... is open and not above the puck").
 
+    Clauses are joined by "and", "or", "unless", "either ... or", "both ... and", "neither ... nor", "not (...)" and
+    parentheses to any depth. "and" binds tighter than "or", and "unless" binds loosest. "always" is a condition that is
+    always true, "never" one that is never true.
+
     Args:
-        text: a condition of at most 64 clauses, such as "Is the gripper open and not above the puck?".
+        text: a condition of at most 256 clauses, such as "Is the gripper open and not above the puck?".
 
     Raises:
         QueryError: the text is not a query; the message points at the wrong word and suggests the nearest query.
@@ -209,14 +300,24 @@ def read_query(text: str, task: Task) -> Query | None:
 
 
 def _parse(text: str, task: Task, explain: bool) -> Query:
-    plain = re.sub(r"\s+", " ", text.replace("’", "'").casefold()).strip(" ?.!")
+    words = split_words(text.replace("’", "'").casefold().strip().strip(" ?.!"))
     clauses: list[Clause] = []
-    parts = re.split(r" and |^and | and$", plain)
-    check_length(text, parts)
-    for part in parts:
-        parser = _ClauseParser(part.split(), task, text, explain)
-        clauses.append(parser.parse(clauses[-1].subject if clauses else None))
-    return Query(tuple(clauses))
+
+    def clause(operand: list[str]) -> Expression:
+        if operand in (["always"], ["never"]):
+            return TRUE if operand == ["always"] else FALSE
+        clauses.append(_ClauseParser(operand, task, text, explain).parse(clauses[-1].subject if clauses else None))
+        return _without_negation(clauses[-1])
+
+    def fail(number: int, expected: str) -> QueryError:
+        parser = _ClauseParser(words, task, text, explain)
+        parser.at = number
+        return parser.error(expected)
+
+    expression = parse_words(words, clause, fail)
+    assert expression is not None  # every operand is a clause or an error
+    is_plain = len(clauses) == 1 + words.count("and") and not _OTHERS.intersection(words)
+    return Query(tuple(clauses) if is_plain else expression)
 
 
 def check_query(query: str | Query, task: str | Task) -> Query:
@@ -224,7 +325,10 @@ def check_query(query: str | Query, task: str | Task) -> Query:
     if not isinstance(query, Query):
         return parse_query(query, task)
     owner = get_task(task)
-    if 0 < len(query.clauses) <= _MOST_CLAUSES and all(_is_of(clause, owner) for clause in query.clauses):
+    clauses = len(query.clauses) if query.is_conjunction else count_mentions(query.expression)
+    if clauses > _MOST_CLAUSES:
+        raise QueryError(f"a query must have at most {_MOST_CLAUSES} clauses when it is written, got {clauses}")
+    if all(_is_of(clause, owner) for clause in query.clauses):
         return query
     return parse_query(str(query), owner)  # resolves aliases, or raises an error that explains the fault
 

@@ -126,7 +126,9 @@ class PlanTables:
             self.number = numbers
         if asserted(number, rows):
             own = numbers[rows]
-            torch._assert_async(((own == number) | (number == 0)).all(), "qaf was computed with plans other than the actor's")
+            torch._assert_async(
+                ((own == number) | (number == 0)).all(), "qaf was computed with plans other than the actor's"
+            )
         if not readable(number, rows):
             return
         own = numbers[rows]

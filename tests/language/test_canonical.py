@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
+from benchmarks.language import as_branches
 from lw_torchrl.language import canonical, roles, step_parser
 from lw_torchrl.language.canonical import (
     MIN_CONFIDENCE,
@@ -209,6 +210,15 @@ def test_the_order_of_clauses_does_not_matter(random, task):
     report, other = explain_canonical(plan), explain_canonical(plan_of(task, *shuffled))
     assert (report.source, report.plan.confidence) == (other.source, other.plan.confidence)
     assert [step.skill for step in report.plan.steps] == [step.skill for step in other.plan.steps]
+
+
+@pytest.mark.parametrize("task", list(OWN))
+def test_a_tree_of_branches_has_the_canonical_form_of_the_flat_plan(task):
+    plan = OWN[task]
+    flat, tree = explain_canonical(plan), explain_canonical(as_branches(plan))
+    assert (tree.source, tree.plan.confidence) == (flat.source, flat.plan.confidence)
+    assert [step.role for step in tree.plan.steps] == [step.role for step in flat.plan.steps]
+    assert lw.ConditionalPlan.from_json(task, as_branches(plan).to_json()) == as_branches(plan)
 
 
 def test_the_longest_name_is_marked():

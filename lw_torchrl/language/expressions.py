@@ -1,0 +1,256 @@
+"""Boolean expressions over hashable leaves, in a normal form whose equal parts are shared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from threading import Lock
+from typing import Any, Literal, NamedTuple, TypeVar
+from weakref import WeakValueDictionary
+
+Kind = Literal["leaf", "all", "any"]
+Result = TypeVar("Result")
+MOST_PARTS = 1_000  # of one conjunction or disjunction; flattening a chain takes the square of its length
+
+
+class _Node:
+    """A leaf (``parts`` is None), or the conjunction of ``parts``. Equal nodes are the same object."""
+
+    __slots__ = ("__weakref__", "leaf", "parts")
+
+    def __init__(self, leaf: Hashable, parts: tuple[Expression, ...] | None) -> None:
+        self.leaf, self.parts = leaf, parts
+
+
+class Expression(NamedTuple):
+    """A boolean expression: a leaf, its negation, or a conjunction or disjunction of expressions.
+
+    :func:`all_of`, :func:`any_of` and :func:`negate` make expressions in normal form. Only leaves are negated; no part
+    of a conjunction is itself a conjunction, a repetition or the negation of other parts, or a disjunction with one of
+    the other parts; the same holds for disjunctions. Parts keep their order. Two expressions are equal if they have the
+    same normal form.
+
+    Equal parts exist once in memory, and functions of this module visit each part once. So an expression takes linear
+    time and memory, even if its text has exponential length. The depth is not limited.
+
+    Example:
+        >>> expression = any_of([all_of(["near", negate("closed")]), "held"])
+        >>> str(expression), [part.kind for part in expression.parts]
+        ('near and not closed or held', ['all', 'leaf'])
+        >>> negate(expression) == all_of([any_of([negate("near"), "closed"]), negate("held")])
+        True
+    """
+
+    node: _Node  # a disjunction is stored as the negation of a conjunction
+    negated: bool
+
+    @property
+    def kind(self) -> Kind:
+        """The kind: a leaf (negated if :attr:`negated`), or a conjunction ("all") or disjunction ("any") of parts."""
+        return "leaf" if self.node.parts is None else "any" if self.negated else "all"
+
+    @property
+    def leaf(self) -> Any:
+        """The value of a leaf, without its negation."""
+        return self.node.leaf
+
+    @property
+    def parts(self) -> tuple[Expression, ...]:
+        """The parts of a conjunction or disjunction; a leaf has none."""
+        parts = self.node.parts or ()
+        return tuple(map(negate, parts)) if self.negated else parts
+
+    def __str__(self) -> str:
+        """Write the expression with "and", "or", "not" and parentheses, which can take exponential time."""
+        return write(self, lambda leaf, negated: f"not {leaf}" if negated else str(leaf))
+
+    def __repr__(self) -> str:
+        return f"<{self}>" if count_mentions(self) <= 100 else f"<{self.kind} of {len(self.parts)} expressions>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        rows: list[tuple[Kind, bool, Any, list[int]]] = []  # a flat list, since pickle limits the depth
+
+        def number(each: Expression, parts: list[int]) -> int:
+            rows.append((each.kind, each.negated, each.leaf, parts))
+            return len(rows) - 1
+
+        fold(self, number)
+        return _rebuild, (rows,)
+
+
+def _rebuild(rows: Iterable[tuple[Kind, bool, Any, list[int]]]) -> Expression:
+    made: list[Expression] = []
+    for kind, negated, leaf, numbers in rows:
+        parts = [made[number] for number in numbers]
+        made.append(_literal(leaf, negated) if kind == "leaf" else all_of(parts) if kind == "all" else any_of(parts))
+    return made[-1]
+
+
+_nodes: WeakValueDictionary[Any, _Node] = WeakValueDictionary()
+_lock = Lock()
+
+
+def _shared(key: Any, leaf: Hashable, parts: tuple[Expression, ...] | None) -> _Node:
+    with _lock:
+        if (node := _nodes.get(key)) is None:
+            node = _nodes[key] = _Node(leaf, parts)
+        return node
+
+
+def _literal(leaf: Any, negated: bool = False) -> Expression:
+    return Expression(_shared((type(leaf), leaf), leaf, None), negated)
+
+
+def as_expression(value: Any) -> Expression:
+    """Return an expression unchanged; convert any other hashable value to a leaf."""
+    return value if isinstance(value, Expression) else _literal(value)
+
+
+def negate(value: Any) -> Expression:
+    """Return the negation of an expression or leaf."""
+    expression = as_expression(value)
+    return Expression(expression.node, not expression.negated)
+
+
+def all_of(parts: Iterable[Any]) -> Expression:
+    """Return the conjunction of expressions or leaves; :data:`TRUE` without any.
+
+    Raises:
+        ValueError: the conjunction has more than 1,000 parts.
+    """
+    distinct: dict[Expression, None] = {}
+    for part in map(as_expression, parts):
+        if part.node.parts is not None and not part.negated:
+            distinct.update(dict.fromkeys(part.parts))
+        else:
+            distinct[part] = None
+        if len(distinct) > MOST_PARTS:
+            raise ValueError(f"a condition must join at most {MOST_PARTS} others by 'and' or 'or'; split the condition")
+    either = [part for part in distinct if part.node.parts is not None]
+    if len({part.node for part in distinct}) < len(distinct):
+        return FALSE  # an expression and its negation have the same node
+    if any(all(other in distinct for other in part.node.parts or ()) for part in either):
+        return FALSE  # "a and b and not (a and b)"
+    if either:
+        negations = {negate(part) for part in distinct}
+        for part in either:
+            if not negations.isdisjoint(part.node.parts or ()):  # "a and (a or b)" is "a"
+                del distinct[part]
+    if len(distinct) == 1:
+        return next(iter(distinct))
+    # The key names parts by id, so that it does not keep them alive; the node does, as long as it exists.
+    key = tuple((id(part.node), part.negated) for part in distinct)
+    return Expression(_shared(key, None, tuple(distinct)), False)
+
+
+def any_of(parts: Iterable[Any]) -> Expression:
+    """Return the disjunction of expressions or leaves; :data:`FALSE` without any. Errors as in :func:`all_of`."""
+    return negate(all_of(map(negate, parts)))
+
+
+TRUE = Expression(_shared((), None, ()), False)
+"""The expression that is always true."""
+FALSE = negate(TRUE)
+"""The expression that is never true."""
+
+
+def fold(expression: Expression, visit: Callable[[Expression, list[Result]], Result]) -> Result:
+    """Compute a result bottom-up: call ``visit(part, results of its parts)`` once for each distinct part."""
+    results: dict[Expression, Result] = {}
+    stack = [expression]
+    while stack:
+        parts = stack[-1].parts
+        if missing := [part for part in parts if part not in results]:
+            stack += reversed(missing)
+            continue
+        each = stack.pop()
+        if each not in results:
+            results[each] = visit(each, [results[part] for part in parts])
+    return results[expression]
+
+
+def evaluate(expression: Expression, truth: Mapping[Any, bool]) -> bool:
+    """Return the truth of an expression, given the truth of its leaves."""
+
+    def visit(each: Expression, parts: list[bool]) -> bool:
+        if each.kind == "leaf":
+            return bool(truth[each.leaf]) != each.negated
+        return all(parts) if each.kind == "all" else any(parts)
+
+    return fold(expression, visit)
+
+
+def replace_leaves(expression: Expression, function: Callable[[Any], Any]) -> Expression:
+    """Replace each leaf with ``function(leaf)``, an expression or a leaf; the function is called once for each leaf."""
+    replaced = {leaf: as_expression(function(leaf)) for leaf in leaves(expression)}
+
+    def visit(each: Expression, parts: list[Expression]) -> Expression:
+        if each.kind == "leaf":
+            return negate(replaced[each.leaf]) if each.negated else replaced[each.leaf]
+        return all_of(parts) if each.kind == "all" else any_of(parts)
+
+    return fold(expression, visit)
+
+
+def literals(expression: Expression) -> tuple[Expression, ...]:
+    """Return the distinct leaves and negated leaves, in the order of their first mention."""
+    found: list[Expression] = []
+
+    def visit(each: Expression, _: list[None]) -> None:
+        if each.kind == "leaf":
+            found.append(each)
+
+    fold(expression, visit)
+    return tuple(found)
+
+
+def leaves(expression: Expression) -> tuple[Any, ...]:
+    """Return the distinct leaves, in the order of their first mention."""
+    return tuple(dict.fromkeys(literal.leaf for literal in literals(expression)))
+
+
+def implied(expression: Expression) -> tuple[Expression, ...]:
+    """Return the leaves and negated leaves that are true wherever the expression is true, as far as its form shows.
+
+    Example:
+        >>> implied(all_of(["a", any_of([all_of([negate("b"), "c"]), negate("b")])]))
+        (<a>, <not b>)
+    """
+
+    def visit(each: Expression, parts: list[dict[Expression, None]]) -> dict[Expression, None]:
+        if each.kind == "leaf":
+            return {each: None}
+        if each.kind == "all":
+            return {literal: None for part in parts for literal in part}
+        return {literal: None for literal in (parts or [{}])[0] if all(literal in part for part in parts)}
+
+    literals: dict[Expression, None] = fold(expression, visit)
+    return tuple(literals)
+
+
+def count_mentions(expression: Expression) -> int:
+    """Return how often the written expression mentions a leaf, without writing the expression."""
+    return fold(expression, lambda each, parts: sum(parts) if each.kind != "leaf" else 1)
+
+
+def write(expression: Expression, literal: Callable[[Any, bool], str]) -> str:
+    """Write an expression with "and", "or" and parentheses: "and" binds tighter. ``literal(leaf, negated)`` writes a
+    leaf. :data:`TRUE` is "always", :data:`FALSE` is "never".
+    """
+
+    texts: list[str] = []
+    stack: list[Expression | str] = [expression]
+    while stack:
+        each = stack.pop()
+        if isinstance(each, str):
+            texts.append(each)
+        elif each.kind == "leaf":
+            texts.append(literal(each.leaf, each.negated))
+        elif not each.parts:
+            texts.append("never" if each.negated else "always")
+        else:
+            joined: list[Expression | str] = []
+            for part in each.parts:
+                bracketed = each.kind == "all" and part.kind == "any"
+                joined += [" and " if each.kind == "all" else " or ", *(("(", part, ")") if bracketed else (part,))]
+            stack += joined[:0:-1]
+    return "".join(texts)

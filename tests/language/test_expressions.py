@@ -1,0 +1,167 @@
+"""Boolean expressions: normal form, sharing, and truth."""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import time
+from copy import deepcopy
+from itertools import product
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lw_torchrl.language import expressions
+from lw_torchrl.language.expressions import (
+    FALSE,
+    TRUE,
+    Expression,
+    all_of,
+    any_of,
+    count_mentions,
+    evaluate,
+    fold,
+    implied,
+    leaves,
+    negate,
+    replace_leaves,
+)
+
+LEAVES = "abcd"
+# Trees of ("all" | "any" | "not", parts) that are interpreted directly.
+TREES = st.recursive(
+    st.sampled_from([*LEAVES, ("all", []), ("any", [])]),
+    lambda inner: (
+        st.tuples(st.sampled_from(["all", "any"]), st.lists(inner, max_size=4)) | st.tuples(st.just("not"), inner)
+    ),
+    max_leaves=20,
+)
+
+
+def build(tree) -> Expression | str:
+    if isinstance(tree, str):
+        return tree
+    operator, parts = tree
+    if operator == "not":
+        return negate(build(parts))
+    return (all_of if operator == "all" else any_of)([build(part) for part in parts])
+
+
+def interpret(tree, truth: dict[str, bool]) -> bool:
+    if isinstance(tree, str):
+        return truth[tree]
+    operator, parts = tree
+    if operator == "not":
+        return not interpret(parts, truth)
+    return (all if operator == "all" else any)([interpret(part, truth) for part in parts])
+
+
+STATES = [dict(zip(LEAVES, values, strict=True)) for values in product((False, True), repeat=len(LEAVES))]
+
+
+@given(TREES)
+def test_truth_equals_that_of_the_tree(tree) -> None:
+    expression = all_of([build(tree)])
+    for truth in STATES:
+        value = interpret(tree, truth)
+        assert evaluate(expression, truth) == value
+        assert evaluate(negate(expression), truth) != value
+        assert not value or all(evaluate(literal, truth) for literal in implied(expression))
+
+
+@given(TREES)
+def test_normal_form(tree) -> None:
+    expression = all_of([build(tree)])
+
+    def check(each: Expression, parts: list) -> None:
+        if each.kind == "leaf":
+            return
+        own = each.parts
+        assert len(own) != 1
+        assert len({*own}) == len(own)
+        assert not any(negate(part) in own or part.kind == each.kind for part in own)
+        assert all(part.parts or part.kind == "leaf" for part in own)
+
+    fold(expression, check)
+    assert negate(negate(expression)) == expression
+    assert all_of([expression, expression]) == any_of([expression, expression]) == expression
+    assert (all_of([expression, negate(expression)]), any_of([expression, negate(expression)])) == (FALSE, TRUE)
+    assert replace_leaves(expression, lambda leaf: leaf) == expression
+    again = replace_leaves(expression, lambda leaf: negate(leaf + leaf))
+    assert replace_leaves(again, lambda leaf: negate(leaf[0])) == expression
+
+
+@given(TREES)
+def test_copies_are_equal(tree) -> None:
+    expression = all_of([build(tree)])
+    for copy in (deepcopy(expression), pickle.loads(pickle.dumps(expression))):
+        assert copy == expression
+        assert hash(copy) == hash(expression)
+        assert copy.node is expression.node
+
+
+def test_text() -> None:
+    expression = all_of([any_of(["a", negate("b")]), any_of(["c", all_of(["a", "d"])])])
+    assert str(expression) == "(a or not b) and (c or a and d)"
+    assert leaves(expression) == ("a", "b", "c", "d")
+    assert count_mentions(expression) == 5
+    assert (str(TRUE), str(FALSE)) == ("always", "never")
+
+
+def test_what_follows_is_simplified() -> None:
+    both = all_of(["a", "b"])
+    assert all_of(["a", any_of(["a", "b"]), "c"]) == all_of(["a", "c"])
+    assert all_of(["b", negate(both), "a"]) == FALSE
+    assert any_of([both, "c", both, any_of(["d"])]) == any_of([both, "c", "d"])
+
+
+def tower(levels: int) -> Expression:
+    """Return alternations whose text is of length 64 ** levels."""
+    tip = all_of(["tip"])
+    for level in range(levels):
+        tip = all_of([any_of([tip, f"{level} {number}"]) for number in range(64)])
+    return tip
+
+
+def test_shared_parts_take_linear_time() -> None:
+    start = time.process_time()
+    doubled = all_of(["x"])
+    for _ in range(1_000):
+        doubled = all_of([doubled, doubled])
+    assert doubled == all_of(["x"])
+    high = tower(30)
+    assert high == tower(30)
+    assert high != negate(high)
+    assert count_mentions(high) > 64**30
+    assert pickle.loads(pickle.dumps(deepcopy(high))) == high
+    assert evaluate(high, dict.fromkeys(leaves(high), True))
+    assert not evaluate(negate(high), dict.fromkeys(leaves(high), True))
+    assert replace_leaves(high, lambda leaf: leaf) == high
+    assert implied(negate(high)) == (negate("tip"),)
+    assert repr(high) == "<all of 64 expressions>"
+    assert time.process_time() - start < 1.0
+
+
+def test_depth_is_not_limited() -> None:
+    deep = all_of(["x"])
+    for level in range(20_000):
+        deep = any_of([all_of([deep, f"and {level}"]), f"or {level}"])
+    assert len(leaves(deep)) == 40_001
+    assert pickle.loads(pickle.dumps(deep)) == deep
+    assert str(deep).count("(") == 19_999
+
+
+def test_unused_nodes_are_freed() -> None:
+    gc.collect()
+    before = len(expressions._nodes)
+    deep = all_of(["x"])
+    for level in range(20_000):
+        deep = any_of([all_of([deep, f"and {level}"]), f"or {level}"])
+    del deep
+    assert len(expressions._nodes) <= before
+
+
+def test_wide_expressions_are_refused() -> None:
+    with pytest.raises(ValueError, match="at most 1000 others"):
+        any_of(map(str, range(1_001)))
