@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import read_toml
-from lw_torchrl.language.expressions import evaluate, leaves, negate, replace_leaves
+from lw_torchrl.language.expressions import Expression, all_of, any_of, evaluate, leaves, negate, replace_leaves
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import GOAL, GRIPPER, Coordinate
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
@@ -307,7 +307,7 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
             by_hand("approach", "grasp", _negated(above), away),
             by_hand("descend", "grasp", above, away),
             by_hand("close", "grasp", near, _gripper_is("open")),
-            *(_own_motions(task, steps, held, point) or [_step(held, motion)]),
+            *(_own_motions(steps, held) or [_step(held, motion)]),
         )
     way, motion = motion.direction, replace(motion, target=point)
     if motion.manner == "press":
@@ -319,16 +319,26 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
     return *approach, _step(near, motion)
 
 
-def _own_motions(task: Task, steps: Sequence[PlanStep], held: Query, point: str) -> list[PlanStep]:
-    """Return the plan's own motions of held objects, each while the object is held, if there are several."""
+def _own_motions(steps: Sequence[PlanStep], held: Query) -> list[PlanStep]:
+    """Return the plan's own motions of a held object, if there are several, with ``held`` instead of their conditions
+    on the gripper. The last one is also active where no other is.
+    """
     moving = [step for step in steps if _role(step).verb in ("carry", "move") and is_held(step)]
     if len({(_role(step).moved, _role(step).target, _role(step).direction) for step in moving}) < 2:
         return []
-    own = []
-    for step in moving:
-        clauses = tuple(clause for clause in step.condition.clauses if GRIPPER not in (clause.subject, clause.object))
-        own.append(_step(Query((*held.clauses, *clauses)), _role(step)))
-    return own
+    guards = [_without_gripper(step.condition) for step in moving]
+    guards[-1] = any_of([guards[-1], negate(any_of(guards))])
+    return [
+        _step(Query(all_of([held.expression, guard])), _role(step)) for step, guard in zip(moving, guards, strict=True)
+    ]
+
+
+def _without_gripper(condition: Query) -> Expression:
+    """Remove the parts of a conjunction that mention the gripper."""
+    whole = condition.expression
+    parts = whole.parts if whole.kind == "all" else (whole,)
+    names = [{name for clause in leaves(part) for name in (clause.subject, clause.object)} for part in parts]
+    return all_of(part for part, mentioned in zip(parts, names, strict=True) if GRIPPER not in mentioned)
 
 
 def _touched(task: Task, roles: Sequence[StepRole]) -> str:
