@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from lw_torchrl._util.checks import shown
-from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item
+from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item, task_name
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep, function_head, one_line, quote
 from lw_torchrl.language.queries import Query
@@ -139,7 +139,7 @@ class PythonReading(Reading):
         """Parse a comment: a heading, a list of steps, or a reason."""
         words = line.strip().lstrip("#")
         numbered, heading = item(words), _HEADING.match(line)
-        if heading and (name := _task_name(heading[1])) in TASKS:
+        if heading and (name := task_name(heading[1])) in TASKS:
             self.open(name, number)
         elif re.fullmatch(r"\s*steps\s*:?\s*", words, re.IGNORECASE):
             self.listing = True
@@ -170,7 +170,7 @@ class PythonReading(Reading):
                 break
             self.blocks.pop()
         if definition := _DEF.match(code):
-            self.open(_task_name(definition[1]), number)
+            self.open(task_name(definition[1]), number)
         elif branch:
             self.branch(number, indent, code, branch)
         elif call:
@@ -245,12 +245,12 @@ class PythonReading(Reading):
             return  # the note on the `if` gives the reason
         skill, goal = f"{call[1]} {' '.join(words)}", named.get("goal", "")
         if call[1] == "move_gripper":
-            skill, goal = _state_to_reach(" ".join(words), named)
+            skill, goal = state_to_reach(" ".join(words), named)
         self.section.clauses.append(Clause(block.line, " and ".join(conditions), skill, goal, " ".join(self.reason)))
         self.reason.clear()
 
 
-def _state_to_reach(place: str, named: dict[str, str]) -> tuple[str, str]:
+def state_to_reach(place: str, named: dict[str, str]) -> tuple[str, str]:
     """Return (skill, goal) for a call of ``robot.move_gripper``; either the skill or the goal is empty."""
     parts = [f"the {GRIPPER} is {place}"] if place else []
     parts += [text for name in ("until", "goal") if (text := named.get(name, ""))]
@@ -264,11 +264,6 @@ def _unquoted(strings: str) -> str:
     """Return the content of adjacent string literals."""
     bodies = [literal.lstrip("fFrRbBuU")[1:-1] for literal in re.findall(_STRING, strings)]
     return " ".join("".join(re.sub(r"\\(.)", r"\1", body) for body in bodies).split())
-
-
-def _task_name(name: str) -> str:
-    """Convert a function's name to a task's name: "door_lock" and "DoorLock" give "door-lock"."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).replace("_", "-").strip("-").lower() or "?"
 
 
 def _statements(text: str) -> Iterator[tuple[int, str]]:
