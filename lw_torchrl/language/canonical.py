@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import read_toml
+from lw_torchrl.language.expressions import all_of, evaluate, leaves, negate, replace_leaves
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import GOAL, GRIPPER, Coordinate
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
@@ -179,7 +180,7 @@ def _gripper_is(predicate: str, name: str | None = None) -> Query:
 
 
 def _negated(query: Query) -> Query:
-    return Query(tuple(replace(clause, negated=not clause.negated) for clause in query.clauses))
+    return Query(negate(query.expression))
 
 
 def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> tuple[PlanStep, ...]:
@@ -244,7 +245,7 @@ def _at_points(condition: Query, task: Task) -> Query:
             return clause
         return replace(clause, subject=at(clause.subject), object=at(clause.object))
 
-    return Query(tuple(map(touched, condition.clauses)))
+    return Query(replace_leaves(condition.expression, touched))
 
 
 def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
@@ -286,7 +287,7 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
     away = _negated(near)
 
     def by_hand(verb: Verb, manner: Manner, *conditions: Query, way: Direction | None = None) -> PlanStep:
-        both = Query(tuple(clause for query in conditions for clause in query.clauses))
+        both = Query(all_of(query.expression for query in conditions))
         return _step(both, StepRole(verb, GRIPPER, point, manner, way, confidence=0.0))
 
     # Complete a pull as a grasp, which also holds objects that the fingers cannot hook.
@@ -302,7 +303,7 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
             by_hand("approach", "grasp", _negated(above), away),
             by_hand("descend", "grasp", above, away),
             by_hand("close", "grasp", near, _gripper_is("open")),
-            _step(Query((*near.clauses, *_gripper_is("closed").clauses)), motion),
+            _step(Query(all_of((near.expression, _gripper_is("closed").expression))), motion),
         )
     way, motion = motion.direction, replace(motion, target=point)
     if motion.manner == "press":
@@ -359,7 +360,8 @@ def _coverage(task: Task, point: str, motion: str, steps: Sequence[tuple[Query, 
     good = 0
     for offset, opening, lift, verbs in _TYPICAL[motion]:
         state = _state(task, point, offset, opening, lift)
-        active = {verb for query, verb in steps if all(_is_true(clause, task, state) for clause in query.clauses)}
+        truth = {clause: _is_true(clause, task, state) for query, _ in steps for clause in leaves(query.expression)}
+        active = {verb for query, verb in steps if evaluate(query.expression, truth)}
         good += bool(active) and active <= verbs
     return good / len(_TYPICAL[motion])
 

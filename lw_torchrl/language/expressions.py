@@ -191,16 +191,21 @@ def replace_leaves(expression: Expression, function: Callable[[Any], Any]) -> Ex
     return fold(expression, visit)
 
 
-def leaves(expression: Expression) -> tuple[Any, ...]:
-    """Return the distinct leaves, in the order of their first mention."""
-    found: dict[Any, None] = {}
+def literals(expression: Expression) -> tuple[Expression, ...]:
+    """Return the distinct leaves and negated leaves, in the order of their first mention."""
+    found: list[Expression] = []
 
     def visit(each: Expression, _: list[None]) -> None:
         if each.kind == "leaf":
-            found[each.leaf] = None
+            found.append(each)
 
     fold(expression, visit)
     return tuple(found)
+
+
+def leaves(expression: Expression) -> tuple[Any, ...]:
+    """Return the distinct leaves, in the order of their first mention."""
+    return tuple(dict.fromkeys(literal.leaf for literal in literals(expression)))
 
 
 def implied(expression: Expression) -> tuple[Expression, ...]:

@@ -12,8 +12,18 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._util.checks import check_choice, typed
+from lw_torchrl.language.connectives import parse_words
+from lw_torchrl.language.expressions import Expression
 from lw_torchrl.language.objects import WORDS
-from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, read_query
+from lw_torchrl.language.queries import (
+    Clause,
+    Query,
+    QueryError,
+    base_clauses,
+    check_length,
+    read_query,
+    split_words,
+)
 from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skills import ScriptedSkill, SkillError, Skills, load_skills, skills_for
 from lw_torchrl.language.tasks import Task, get_task
@@ -26,6 +36,7 @@ if TYPE_CHECKING:
 _NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
 # Words that do not affect the choice of a query.
 _EMPTY = frozenset(("the", "a", "an", "is", "are", "be", "does", "do", "did", "has", "have", "robot's", "robot"))
+_JOINS = frozenset(("or", "nor", "unless", "either", "neither", "both", "("))
 _LONGEST = 400  # maximum length (characters) of a text to map
 _MOST_CLAUSES = 8  # maximum number of clauses of a condition to map
 _MOST_COMPARED = 64  # maximum number of texts to map per answer, which bounds the decoding time
@@ -57,16 +68,17 @@ class QueryMatch:
 def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] = "edit") -> QueryMatch:
     """Find the query of a task that is nearest to a text.
 
-    A query matches itself. Any other text is split at "and" and "but", and each part matches the nearest base query. A
-    part without a subject inherits the subject of the previous part. A part with "not", "doesn't" or "never" matches
-    the negation of the base query nearest to the remaining words, so that a match never inverts the meaning.
+    A query matches itself. Any other text is split at "and", "or" and the other words that :func:`parse_query` reads,
+    and at "but", and each part matches the nearest base query. A part without a subject inherits the subject of the
+    previous part. A part with "not", "doesn't" or "never" matches the negation of the base query nearest to the
+    remaining words, so that a match never inverts the meaning.
 
     Args:
-        text: any text with at most 64 parts.
+        text: any text with at most 256 parts.
         by: "edit" compares spelling; "embedding" compares meaning and needs the extra ``[text]``.
 
     Raises:
-        QueryError: the text has more than 64 parts.
+        QueryError: the text has more than 256 parts.
         ImportError: the extra ``[text]`` is not installed.
 
     Example:
@@ -78,23 +90,49 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
     owner = get_task(task)
     if (query := read_query(text, owner)) is not None:
         return QueryMatch(query, 1.0, tuple(QueryPart(str(clause), Query((clause,)), 1.0) for clause in query.clauses))
-    split = [" ".join(part.split()) for part in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]
-    split = [part for part in split if _content(_affirmed(part)[0])] or [" ".join(text.split())]
-    check_length(text, split)
+    pieces = [" ".join(piece.split()) for piece in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]
+    pieces = [piece for piece in pieces if _content(_affirmed(piece)[0])] or [" ".join(text.split())]
+    words = split_words(" and ".join(pieces))
+    check_length(text, words)
+    # Spaces hide other words such as "or" from the parser.
+    conjunction = _nearest_match([word for piece in pieces for word in ("and", f" {piece}")][1:], owner, by)
+    if not _JOINS.intersection(word.casefold() for word in words):
+        return conjunction
+    try:
+        match = _nearest_match(words, owner, by)
+    except QueryError:  # a stray parenthesis
+        match = _nearest_match([word for word in words if word not in "()"], owner, by)
+    # "at or near the puck" does not consist of two conditions.
+    worst, least = (min(part.score for part in each.parts) for each in (conjunction, match))
+    return match if least >= min(worst, 1.0 - LIMIT) else conjunction
+
+
+def _nearest_match(words: list[str], task: Task, by: str) -> QueryMatch:
+    """Match each operand among words that :func:`parse_words` accepts."""
     known: dict[tuple[str, str], QueryPart] = {}  # a cache, since parts often repeat
     parts: list[QueryPart] = []
     subject = ""
-    for part in split:
+
+    def nearest(operand: list[str]) -> Expression | None:
+        nonlocal subject
+        part = " ".join(operand).strip()
+        if not _content(_affirmed(part)[0]):
+            return None
         if (part, subject) not in known:
-            match = _nearest_part(part, owner, by)
+            match = _nearest_part(part, task, by)
             if subject and match.score < 1.0:
-                joined = _nearest_part(f"the {subject} {part}", owner, by)
+                joined = _nearest_part(f"the {subject} {part}", task, by)
                 match = joined._replace(text=part) if joined.score > match.score else match
             known[part, subject] = match
         parts.append(known[part, subject])
-        subject = parts[-1].query.clauses[0].subject
-    query = Query(tuple(clause for part in parts for clause in part.query.clauses))
-    return QueryMatch(query, sum(part.score for part in parts) / len(parts), tuple(parts))
+        subject = next((clause.subject for clause in parts[-1].query.clauses), subject)
+        return parts[-1].query.expression
+
+    expression = parse_words(words, nearest, lambda *_: QueryError("stray parenthesis"))
+    if expression is None:  # a text without content
+        parts.append(_nearest_part(" ".join(" ".join(words).split()), task, by))
+        expression = parts[0].query.expression
+    return QueryMatch(Query(expression), sum(part.score for part in parts) / len(parts), tuple(parts))
 
 
 def _nearest_part(part: str, task: Task, by: str) -> QueryPart:

@@ -10,6 +10,7 @@ from typing import Any
 
 from lw_torchrl._util.checks import Finite, Natural, check_choice, shown, typed_fields
 from lw_torchrl._util.files import read_toml
+from lw_torchrl.language.connectives import CONNECTIVES
 from lw_torchrl.language.layout import METAWORLD, Layout, places
 
 WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "words.toml", ValueError)
@@ -52,7 +53,7 @@ class NamedObject:
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9'-]*( [a-z0-9][a-z0-9'-]*)*", self.name):
             raise ValueError(f"name must be lower-case words like 'drawer handle', got {shown(self.name)}")
-        if {"and", "is", "not", "the"} & set(self.name.split()):
+        if {*CONNECTIVES, "is", "not", "the"} & set(self.name.split()):
             raise ValueError(f"name must not contain 'and', 'is', 'not' or 'the', got {shown(self.name)}")
         if self.opening is not None and (self.ours or self.name == GRIPPER):
             raise ValueError(f"opening of {self.name!r} must be None: points have none, the gripper's is in the layout")

@@ -4,13 +4,27 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from itertools import permutations
 
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._util.checks import typed
+from lw_torchrl.language.connectives import parse_words
+from lw_torchrl.language.expressions import (
+    FALSE,
+    TRUE,
+    Expression,
+    all_of,
+    count_mentions,
+    implied,
+    leaves,
+    literals,
+    negate,
+    replace_leaves,
+    write,
+)
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, STATES, TOUCHING, UNARY
@@ -18,7 +32,7 @@ from lw_torchrl.language.tasks import Task, get_task
 
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
-_MOST_CLAUSES = 64  # per query; the query tables are padded to the longest query
+_MOST_CLAUSES = 256  # in the text of a query
 
 
 @dataclass(frozen=True)
@@ -37,27 +51,71 @@ class Clause:
 
 @dataclass(frozen=True)
 class Query:
-    """A conjunction of clauses, which is true if every clause is true. ``str(query)`` is the canonical spelling.
+    """A condition: a boolean expression over clauses. ``str(query)`` is the canonical spelling.
+
+    Queries are equal if their expressions have the same normal form.
+
+    Args:
+        expression: an expression over clauses (:mod:`lw_torchrl.language.expressions`); or clauses that must all be
+            true.
 
     Example:
         >>> str(parse_query("Is the gripper open and not above the puck?", task="pick-place"))
         "the robot's gripper is open and the robot's gripper is not above the puck"
+        >>> query = parse_query("the gripper is neither open nor (near the puck unless above the puck)", task="push")
+        >>> print(query)
+        the robot's gripper is not open and (the robot's gripper is not near the puck or the robot's gripper is above the puck)
     """
 
-    clauses: tuple[Clause, ...]
+    expression: Expression
+
+    def __post_init__(self) -> None:
+        given = self.expression if isinstance(self.expression, Expression) else all_of(self.expression)
+        positive = replace_leaves(given, _without_negation) if any(leaf.negated for leaf in leaves(given)) else given
+        object.__setattr__(self, "expression", positive)
 
     def __str__(self) -> str:
-        return " and ".join(map(str, self.clauses))
+        return write(self.expression, lambda clause, negated: str(replace(clause, negated=negated)))
+
+    @property
+    def is_conjunction(self) -> bool:
+        """True for a clause or a conjunction of clauses: a query without "or"."""
+        parts = self.expression.parts
+        return self.expression.kind != "any" and all(part.kind == "leaf" for part in parts)
+
+    @cached_property
+    def clauses(self) -> tuple[Clause, ...]:
+        """The distinct clauses that the query mentions, in order; for a conjunction, the clauses that must be true."""
+        return tuple(map(_as_clause, literals(self.expression)))
+
+    @cached_property
+    def implied(self) -> tuple[Clause, ...]:
+        """The clauses that are true wherever the query is true, as far as its form shows."""
+        return tuple(map(_as_clause, implied(self.expression)))
+
+
+def _without_negation(clause: Clause) -> Expression:
+    positive = all_of([replace(clause, negated=False)])
+    return negate(positive) if clause.negated else positive
+
+
+def _as_clause(literal: Expression) -> Clause:
+    return replace(literal.leaf, negated=True) if literal.negated else literal.leaf
 
 
 class QueryError(ValueError):
     """The error for a text that is not a query about the objects of its task."""
 
 
-def check_length(text: str, parts: Sequence[str]) -> None:
+def check_length(text: str, words: Sequence[str]) -> None:
     """Raise a QueryError if a text has more clauses than a query may have."""
-    if len(parts) > _MOST_CLAUSES:
-        raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {len(parts)}")
+    if (clauses := 1 + sum(word.casefold() in ("and", "or", "nor", "unless") for word in words)) > _MOST_CLAUSES:
+        raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {clauses}")
+
+
+def split_words(text: str) -> list[str]:
+    """Split a text into words and parentheses."""
+    return re.findall(r"[()]|[^\s()]+", text)
 
 
 @lru_cache(maxsize=256)
@@ -150,9 +208,12 @@ class _ClauseParser:
         if not self.words:
             raise self.error("a condition")
         negated = self.take("isn't")
-        if not negated:
+        denied = not negated and self.take("not")  # "not the gripper is open"
+        if not negated and not denied:
             self.take("is")
         subject = self.name()
+        if subject is None and denied:
+            self.at, denied = 0, False
         if subject is None:
             if previous is None or self.at_article():
                 raise self.name_error()
@@ -174,8 +235,8 @@ class _ClauseParser:
             self.at = start
             raise self.name_error(f"an object other than {subject!r}")
         if self.at < len(self.words):
-            raise self.error("the end of the clause, or 'and'")
-        return Clause(subject, predicate, other, negated)
+            raise self.error("the end of the clause, 'and' or 'or'")
+        return Clause(subject, predicate, other, negated != denied)
 
 
 @typed
@@ -185,8 +246,12 @@ def parse_query(text: str, task: str | Task) -> Query:
     The text may be a question, use capitals, omit articles, and contain "the gripper" or "isn't". A clause may omit its
     subject if the previous clause has the same subject ("... is open and not above the puck").
 
+    Clauses are joined by "and", "or", "unless", "either ... or", "both ... and", "neither ... nor", "not (...)" and
+    parentheses to any depth. "and" binds tighter than "or", and "unless" binds loosest. "always" is a condition that is
+    always true, "never" one that is never true.
+
     Args:
-        text: a condition of at most 64 clauses, such as "Is the gripper open and not above the puck?".
+        text: a condition of at most 256 clauses, such as "Is the gripper open and not above the puck?".
 
     Raises:
         QueryError: the text is not a query; the message points at the wrong word and suggests the nearest query.
@@ -209,14 +274,26 @@ def read_query(text: str, task: Task) -> Query | None:
 
 
 def _parse(text: str, task: Task, explain: bool) -> Query:
-    plain = re.sub(r"\s+", " ", text.replace("’", "'").casefold()).strip(" ?.!")
-    clauses: list[Clause] = []
-    parts = re.split(r" and |^and | and$", plain)
-    check_length(text, parts)
-    for part in parts:
-        parser = _ClauseParser(part.split(), task, text, explain)
-        clauses.append(parser.parse(clauses[-1].subject if clauses else None))
-    return Query(tuple(clauses))
+    words = split_words(text.replace("’", "'").casefold().strip().strip(" ?.!"))
+    check_length(text, words)
+    subject: str | None = None
+
+    def clause(operand: list[str]) -> Expression:
+        nonlocal subject
+        if operand in (["always"], ["never"]):
+            return TRUE if operand == ["always"] else FALSE
+        parsed = _ClauseParser(operand, task, text, explain).parse(subject)
+        subject = parsed.subject
+        return _without_negation(parsed)
+
+    def fail(number: int, expected: str) -> QueryError:
+        parser = _ClauseParser(words, task, text, explain)
+        parser.at = number
+        return parser.error(expected)
+
+    expression = parse_words(words, clause, fail)
+    assert expression is not None  # every operand is a clause or an error
+    return Query(expression)
 
 
 def check_query(query: str | Query, task: str | Task) -> Query:
@@ -224,7 +301,9 @@ def check_query(query: str | Query, task: str | Task) -> Query:
     if not isinstance(query, Query):
         return parse_query(query, task)
     owner = get_task(task)
-    if 0 < len(query.clauses) <= _MOST_CLAUSES and all(_is_of(clause, owner) for clause in query.clauses):
+    if (clauses := count_mentions(query.expression)) > _MOST_CLAUSES:
+        raise QueryError(f"a query must have at most {_MOST_CLAUSES} clauses when it is written, got {clauses}")
+    if all(_is_of(clause, owner) for clause in query.clauses):
         return query
     return parse_query(str(query), owner)  # resolves aliases, or raises an error that explains the fault
 

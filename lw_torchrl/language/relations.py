@@ -11,6 +11,7 @@ from typing import Any, Literal
 from lw_torchrl._util.checks import Finite, Positive, shown, typed_fields
 from lw_torchrl._util.files import read_toml
 from lw_torchrl._util.registry import Registry
+from lw_torchrl.language.connectives import CONNECTIVES
 from lw_torchrl.language.layout import Layout
 
 
@@ -51,7 +52,7 @@ def _check_predicate(name: str, parts: Any, others: Iterable[str]) -> tuple[Comp
         raise ValueError(f"name of a predicate must be lower-case words like 'left of', got {shown(name)}")
     first, *_ = words = name.split()
     reserved = [name] * (name in others) + [first] * (first in ("is", "isn't", "not"))
-    if reserved := reserved + [word for word in words if word in ("and", "the", "a", "an")]:
+    if reserved := reserved + [word for word in words if word in (*CONNECTIVES, "the", "a", "an")]:
         raise ValueError(f"name {name!r} must not contain {reserved[0]!r}, which is reserved in queries")
     if not isinstance(parts, (tuple, list)) or not parts or not all(isinstance(part, Comparison) for part in parts):
         raise ValueError(f"{name!r} must be a tuple of at least one Comparison, got {shown(parts)}")

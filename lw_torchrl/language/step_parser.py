@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from lw_torchrl.language.objects import GOAL, GRIPPER, WORDS
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.queries import Clause
 from lw_torchrl.language.roles import Direction, Verb, mark_objects, simplify
 from lw_torchrl.language.tasks import Task, first_object, is_goal, object_of, same_object, whole_objects
 
@@ -34,9 +35,14 @@ class ParsedStep:
     toward: str | None = None  # the object in the direction "goal"; None for the task's goal
 
 
+def _stated(step: PlanStep) -> tuple[Clause, ...]:
+    """Return the clauses that a step's condition implies; if it implies none, all clauses that it mentions."""
+    return step.condition.implied or step.condition.clauses
+
+
 def compared_with_gripper(step: PlanStep) -> tuple[str, ...]:
     """Return the objects that a step's condition compares with the gripper, in the condition's order."""
-    pairs = [(clause.subject, clause.object) for clause in step.condition.clauses if clause.object is not None]
+    pairs = [(clause.subject, clause.object) for clause in _stated(step) if clause.object is not None]
     return tuple(second if first == GRIPPER else first for first, second in pairs if GRIPPER in (first, second))
 
 
@@ -55,7 +61,7 @@ class _Facts:
     @classmethod
     def of(cls, step: PlanStep) -> _Facts:
         facts = dict.fromkeys(("at", "not_at", "aligned", "not_aligned", "open", "closed"), False)
-        for clause in step.condition.clauses:
+        for clause in step.condition.implied:
             if clause.subject == GRIPPER and clause.object is None:
                 facts["open" if (clause.predicate == "open") != clause.negated else "closed"] = True
             elif clause.object is not None and GRIPPER in (clause.subject, clause.object):
@@ -261,7 +267,7 @@ class _StepParser:
 
     def _pairs(self) -> list[tuple[str, str]]:
         """Return the pairs of objects that the condition compares, except pairs that are near or around each other."""
-        clauses = [c for c in self.step.condition.clauses if c.negated or c.predicate not in ("near", "around")]
+        clauses = [c for c in _stated(self.step) if c.negated or c.predicate not in ("near", "around")]
         return [(c.subject, c.object) for c in clauses if c.object is not None and GRIPPER not in (c.subject, c.object)]
 
     def _compared_point(self, moved: str, target: str) -> str:

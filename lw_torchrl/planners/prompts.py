@@ -148,8 +148,10 @@ def write_structured(plan: ConditionalPlan, style: Style) -> str:
     return json.dumps({"steps": steps})
 
 
-def _write_query(query: Query) -> list[dict[str, str]]:
-    """Convert a query to JSON: one object per clause."""
+def _write_query(query: Query) -> list[dict[str, str]] | str:
+    """Convert a query to JSON: one object per clause of a conjunction, or a sentence for any other query."""
+    if not query.is_conjunction:
+        return str(query)
     rows = []
     for clause in query.clauses:
         row = {"first": f"the {clause.subject}", "is": f"{'not ' if clause.negated else ''}{clause.predicate}"}
@@ -193,7 +195,8 @@ def _read_query(value: Any) -> str:
             texts.append(" ".join(word for word in words if isinstance(word, str)))
         elif isinstance(row, str):
             texts.append(row)
-    return " and ".join(one_line(text) for text in texts if text.strip())
+    texts = [one_line(text) for text in texts if text.strip()]
+    return " and ".join(f"({text})" if len(texts) > 1 and " or " in text else text for text in texts)
 
 
 # Limits that stop a model that repeats itself; shipped plans have at most 6 steps, with at most 5 clauses each.

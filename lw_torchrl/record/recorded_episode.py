@@ -13,9 +13,10 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
+from lw_torchrl.language.expressions import write
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.queries import Query
+from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
@@ -236,10 +237,16 @@ def short_condition(condition: Any) -> str:
     """Shorten a condition, for example to "gripper above and not left or right of puck"; only queries are shortened."""
     if not isinstance(condition, Query):
         return str(condition)
+    if condition.is_conjunction:
+        return _short_conjunction(condition.clauses) or str(condition)
+    return write(condition.expression, lambda clause, negated: _short_conjunction([replace(clause, negated=negated)]))
+
+
+def _short_conjunction(listed: Sequence[Clause]) -> str:
     parts, last_subject = [], ""
     # Consecutive clauses about the same two objects form one part; a clause without an object forms its own part.
-    numbered = [(c.subject, c.object, i if c.object is None else -1) for i, c in enumerate(condition.clauses)]
-    for (subject, target, _), pairs in groupby(zip(numbered, condition.clauses, strict=True), lambda pair: pair[0]):
+    numbered = [(c.subject, c.object, i if c.object is None else -1) for i, c in enumerate(listed)]
+    for (subject, target, _), pairs in groupby(zip(numbered, listed, strict=True), lambda pair: pair[0]):
         clauses = [clause for _, clause in pairs]
         words = ["" if subject == last_subject else subject.removeprefix("robot's ")]
         last_subject, negated = subject, False

@@ -47,9 +47,9 @@ def _call(step: PlanStep, goal: Query | None) -> str:
     if goal is None:
         verb, _, details = step.skill.partition(" ")
         return f"{verb}({quote(details)})"
-    first, *others = goal.clauses
+    first, *others = goal.clauses or [None]
     held = _HELD.get(" and ".join(map(str, others)))
-    if first.subject != GRIPPER or first.object is None or held is None:
+    if not goal.is_conjunction or first is None or first.subject != GRIPPER or first.object is None or held is None:
         return f"move_gripper(until={quote(str(goal))})"
     return f"move_gripper({quote(str(first).removeprefix(f'the {GRIPPER} is '))}{held})"
 

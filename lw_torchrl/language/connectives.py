@@ -1,0 +1,99 @@
+"""The words that join conditions: "and", "or", "unless", "either ... or", "neither ... nor", and parentheses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from lw_torchrl.language.expressions import Expression, all_of, any_of, negate
+
+CONNECTIVES = ("and", "or", "nor", "unless", "either", "neither", "both")
+"""The words that join conditions, which no name of an object or a relation may contain."""
+
+
+@dataclass
+class _Group:
+    """The operands that a parser has read since a parenthesis, "either", "both" or "neither"."""
+
+    opener: str
+    negated: bool
+    parts: list[Expression] = field(default_factory=list)  # joined by "and"
+    alternatives: list[Expression] = field(default_factory=list)  # joined by "or"
+    exceptions: list[Expression] = field(default_factory=list)  # a condition, and those after "unless"
+
+    def end(self, joined: list[Expression]) -> None:
+        """End a conjunction or disjunction, which becomes a part of ``joined``."""
+        if self.parts:
+            self.alternatives.append(all_of(self.parts))
+            self.parts = []
+        if joined is self.exceptions and self.alternatives:
+            joined.append(any_of(self.alternatives))
+            self.alternatives = []
+
+    def add(self, part: Expression | None, negated: bool) -> None:
+        if part is not None:
+            self.parts.append(negate(part) if negated else part)
+
+    @property
+    def condition(self) -> Expression | None:
+        self.end(self.exceptions)
+        if not self.exceptions:
+            return None
+        first, *others = self.exceptions
+        return all_of([first, *map(negate, others)])
+
+
+# The groups that a word ends; a parenthesis and the end of the text end all but "(".
+_ENDS = {"and": ("neither",), "or": ("both", "neither"), "nor": ("both", "either")}
+
+
+def parse_words(
+    words: Sequence[str],
+    operand: Callable[[list[str]], Expression | None],
+    fail: Callable[[int, str], Exception],
+) -> Expression | None:
+    """Parse a condition in English: "A or B", "not (A and B)", "neither A nor B", "either A or B", "A unless B".
+
+    "and" binds tighter than "or", and "unless" binds loosest. The words before a parenthesis, "either", "both" or
+    "neither" belong to the first operand in it: "the gripper is (open or closed)".
+
+    Args:
+        words: words and parentheses.
+        operand: a function that parses the words of an operand, in the order of the text; None to skip the operand.
+        fail: a function that makes the error for word number n (from 0), given what was expected there.
+    """
+    stack, pending, negated, expects = [_Group("", False)], list[str](), False, True
+    for number, given in enumerate((*words, "")):
+        word = given.casefold()
+        opens = word in ("(", "either", "both", "neither")
+        if not expects and (opens or word not in ("", ")", *CONNECTIVES)):
+            raise fail(number, "'and', 'or' or the end of the condition")
+        if opens:
+            # In "the gripper is not (A or B)", "not" negates the group, and "the gripper is" begins A.
+            for denied in ("not", "isn't"):
+                negated ^= [each.casefold() for each in pending].count(denied) % 2 == 1
+            pending = ["is" if each.casefold() == "isn't" else each for each in pending if each.casefold() != "not"]
+            stack.append(_Group(word, negated != (word == "neither")))
+            negated = False
+        elif word not in ("", ")", *CONNECTIVES):
+            pending.append(given)
+        else:
+            if expects:
+                stack[-1].add(operand(pending), negated)
+                pending, negated = [], False
+            while stack[-1].opener in _ENDS.get(word, ("either", "both", "neither")):
+                group = stack.pop()
+                stack[-1].add(group.condition, group.negated)
+            if word in ("", ")"):
+                if (stack[-1].opener == "(") != (word == ")"):
+                    raise fail(number, "')'" if stack[-1].opener else "no ')', since no '(' comes before")
+                if word == ")":
+                    group = stack.pop()
+                    stack[-1].add(group.condition, group.negated)
+            elif word == "unless":
+                stack[-1].end(stack[-1].exceptions)
+            elif word == "or" or stack[-1].opener == "neither":
+                stack[-1].end(stack[-1].alternatives)
+            negated = word == "nor" and stack[-1].opener != "neither"
+            expects = word not in ("", ")")
+    return stack[0].condition
