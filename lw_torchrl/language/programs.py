@@ -90,8 +90,14 @@ class Label:
     name: str
 
 
+@dataclass(frozen=True)
+class Done:
+    """A leaf of a condition: the effect of an action is reached."""
+
+    text: str  # of the action
+
+
 Node: TypeAlias = Action | Check | Branch | Sequence | Block | Selector | Loop | Jump | Label
-Literal: TypeAlias = Expression | str
 
 
 @dataclass

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-
 from importlib.resources import files
 from typing import Any
 
@@ -13,7 +12,8 @@ from lw_torchrl._util.files import read_toml
 from lw_torchrl.language.expressions import Expression
 from lw_torchrl.language.objects import WORDS
 from lw_torchrl.language.plans import ConditionalPlan
-from lw_torchrl.language.programs import Node
+from lw_torchrl.language.programs import Action, Node
+from lw_torchrl.language.programs import Sequence as InTurn
 from lw_torchrl.language.tasks import Task
 
 
@@ -99,6 +99,10 @@ class Reading:
         """Append a note on a line."""
         self.notes.append(Note(line, text))
 
+    def add_tree(self, task: str, line: int, tree: Node) -> None:
+        """Append a section with a program."""
+        self.sections.append(Section(task, line, tree=tree))
+
     def open(self, task: str, line: int) -> None:
         """Begin a section for a task, unless a ``def`` follows right below a heading for the same task."""
         if self.section.task != task or self.section.clauses:
@@ -145,3 +149,31 @@ def task_name(name: str) -> str:
 def is_for_any_task(name: str) -> bool:
     """Return whether a function's name names no task: "policy", "step"."""
     return " ".join(words_of(name)) in PROGRAM_WORDS["any_task"]
+
+
+_FENCE = re.compile(r"^[ \t]*(?:```|~~~).*$", re.MULTILINE)
+
+
+def code_blocks(text: str) -> Iterator[tuple[int, str]]:
+    """Yield (number of lines before, text) of each fenced block, or of the whole text if there is no fence."""
+    if end := END.search(text):
+        text = text[: end.start()]
+    fences = [(match.start(), match.end()) for match in _FENCE.finditer(text)]
+    if not fences:
+        yield 0, text
+    for (_, start), (end_at, _) in zip(fences[::2], [*fences[1::2], (len(text), 0)], strict=False):
+        yield text.count("\n", 0, start), text[start:end_at]
+
+
+_AND = re.compile(r",?\s(?:and|then)(?:\sthen)?\s(?=(\w+))")
+
+
+def in_turn(text: str, line: int) -> Node:
+    """Return the actions that a text joins: "open the gripper and move above the puck" gives two, in turn."""
+    parts, start = list[Node](), 0
+    for match in _AND.finditer(text):
+        if match[1].lower() in PROGRAM_WORDS["motions"]:
+            parts.append(Action(text[start : match.start()], line))
+            start = match.end()
+    parts.append(Action(text[start:], line))
+    return parts[0] if len(parts) == 1 else InTurn(tuple(parts))

@@ -5,17 +5,16 @@ from __future__ import annotations
 import ast
 import re
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 from lw_torchrl._util.checks import shown
 from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, as_expression, negate
 from lw_torchrl.language.formats.base import (
-    END,
     PROGRAM_WORDS,
     Reading,
-    Section,
+    code_blocks,
     is_for_any_task,
     is_verb,
     task_name,
@@ -27,7 +26,6 @@ from lw_torchrl.language.programs import Action, Block, Branch, Jump, Label, Loo
 PYTHON = PROGRAM_WORDS["python"]
 _MOST_REPAIRS = 8  # maximum number of syntax errors to cut off
 _MOST_INLINED = 500  # maximum number of inlined calls and unrolled rounds, which bounds the time
-_FENCE = re.compile(r"^[ \t]*(?:```|~~~).*$", re.MULTILINE)
 _START = re.compile(r"\s*(?:(?:async\s+)?def|class|if|while|for|import|from|@\w+|[\w.]+\s*[=(])(?!\w)")
 
 
@@ -49,7 +47,7 @@ class CodeReading(Reading):
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        for start, code in _code_blocks(text):
+        for start, code in code_blocks(text):
             if (module := self.parse(code.expandtabs(4).splitlines(), start)) is not None:
                 _Module(self, module)
 
@@ -80,19 +78,6 @@ class CodeReading(Reading):
                 ast.increment_lineno(module, start - 1)
                 return module
         return None
-
-
-def _code_blocks(text: str) -> Iterator[tuple[int, str]]:
-    """Yield (number of lines before, text) of each fenced block, or of the whole text without fences."""
-    if end := END.search(text):
-        text = text[: end.start()]
-    fences = [(match.start(), match.end()) for match in _FENCE.finditer(text)]
-    if not fences:
-        yield 0, text
-    for number in range(0, len(fences), 2):
-        start = fences[number][1]
-        end_at = fences[number + 1][0] if number + 1 < len(fences) else len(text)
-        yield text.count("\n", 0, start), text[start:end_at]
 
 
 _Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
@@ -126,7 +111,7 @@ class _Module:
         """Add a section with the tree of some statements, which leaves out calls of the functions ``roots``."""
         tree = _Scope(self, {}, roots).block(body)
         if next(actions_of(tree), None) is not None:
-            self.reading.sections.append(Section(task, line, tree=tree))
+            self.reading.add_tree(task, line, tree)
 
 
 class _Scope:
