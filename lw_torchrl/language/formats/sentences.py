@@ -19,14 +19,14 @@ _OTHERWISE = re.compile(r"(?:otherwise|or else|else|if not|in (?:all|any) other 
 _WHEN = re.compile(r"(if|when|whenever|once|while|as long as|as soon as|after|unless|until)\s+(.+)", re.IGNORECASE)
 _TRAILING = re.compile(r"(.+?),?\s(if|when|unless|as long as|whenever)\s(.+)", re.IGNORECASE)
 _REPEAT = re.compile(
-    r"(?:repeat|loop|keep (?:going|repeating)|continue)\b(?:.*?\bsteps?\s+(\d+)(?:\s*(?:and|to|-|–|through)\s*(?:step\s*)?(\d+))?)?"
-    r".*?\b(until|while|as long as)\s+(.+)",
+    r"(?:repeat|loop|keep (?:going|repeating)|continue)\b"
+    r"(?:.*?\bsteps?\s+(\d+))?.*?\b(until|while|as long as)\s+(.+)",
     re.IGNORECASE,
 )
 _GO_TO = re.compile(r"(?:go|skip|return|jump|move|continue|proceed)\b.*?\bstep\s+(\d+)", re.IGNORECASE)
 _SHOULD = re.compile(
-    r"(?:then\s+)?(?:the\s+)?(?:robot|it|you|we)\s+(?:should|must|needs? to|has to|have to|will|can|shall)\s+(?:then\s+|just\s+)?"
-    r"|(?:then|first|just|please|simply)\s+",
+    r"(?:then\s+)?(?:the\s+)?(?:robot|it|you|we)\s+(?:should|must|needs? to|has to|have to|will|can|shall)\s+"
+    r"(?:then\s+|just\s+)?|(?:then|first|just|please|simply)\s+",
     re.IGNORECASE,
 )
 _SUBJECT = re.compile(r"(?:not\s+)?((?:the|a)\s[\w' -]+?)\s(?:is|are|has)\b", re.IGNORECASE)
@@ -43,10 +43,9 @@ class _Choice:
 
 @dataclass(frozen=True)
 class _Repeat:
-    """The instruction to repeat the steps from one number to another, while a condition is true."""
+    """The instruction to repeat the steps from a number on ("" for all steps) while a condition is true."""
 
     first: str
-    last: str
     condition: Expression
 
 
@@ -54,7 +53,7 @@ _Part = Node | _Choice | _Repeat
 
 
 class SentenceReading(Reading):
-    """A reader of instructions in prose, which become one tree. Numbered steps run in turn, other lines side by side."""
+    """A reader of instructions, which become one tree. Numbered steps run in turn, other lines side by side."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -99,9 +98,9 @@ class SentenceReading(Reading):
             chain, text = None, text[other.end() :] if other else text
         repeat = _REPEAT.match(text)
         if repeat and chain is None:
-            condition = _condition(repeat[4])
-            condition = negate(condition) if repeat[3].lower() == "until" else condition
-            self.root.append(_Repeat(repeat[1] or "", repeat[2] or repeat[1] or "", condition))
+            condition = _condition(repeat[3])
+            condition = negate(condition) if repeat[2].lower() == "until" else condition
+            self.root.append(_Repeat(repeat[1] or "", condition))
         elif (when := _WHEN.match(text)) and (parts := _split(when[2])):
             self.conditional(when[1].lower(), *parts, chain)
         elif (when := _TRAILING.match(text)) and is_verb(when[1].split()) and not re.search(r"\buntil\b", when[1]):
@@ -124,8 +123,8 @@ class SentenceReading(Reading):
         scope = self.scopes[-1]
         if chain is not None:
             chain.branches.append((test, body))
-        elif action.endswith(" instead") and scope:
-            scope[-1] = _Choice([(test, body)], [scope[-1]])
+        elif action.endswith(" instead") and (replaced := _last_action(scope)):
+            replaced[-1] = _Choice([(test, body)], [replaced[-1]])
         else:
             scope.append(_Choice([(test, body)]))
         self.body(action, body)
@@ -160,6 +159,13 @@ class SentenceReading(Reading):
             body.append(Action(text, action.line))
             if _ENDS.match(text):
                 body.append(Jump())
+
+
+def _last_action(parts: list[_Part]) -> list[_Part]:
+    """Return the list whose last part is the last action; [] if the last part is not an action."""
+    while parts and isinstance(last := parts[-1], _Choice):
+        parts = last.branches[-1][1] if last.otherwise is None else last.otherwise
+    return parts if parts and isinstance(parts[-1], Action) else []
 
 
 def _split(text: str) -> tuple[str, str] | None:
