@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import read_toml
-from lw_torchrl.language.expressions import all_of, evaluate, leaves, negate, replace_leaves
+from lw_torchrl.language.expressions import evaluate, leaves, negate, replace_leaves
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import GOAL, GRIPPER, Coordinate
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
@@ -245,6 +245,8 @@ def _at_points(condition: Query, task: Task) -> Query:
             return clause
         return replace(clause, subject=at(clause.subject), object=at(clause.object))
 
+    if condition.is_conjunction:
+        return Query(tuple(map(touched, condition.clauses)))
     return Query(replace_leaves(condition.expression, touched))
 
 
@@ -287,7 +289,7 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
     away = _negated(near)
 
     def by_hand(verb: Verb, manner: Manner, *conditions: Query, way: Direction | None = None) -> PlanStep:
-        both = Query(all_of(query.expression for query in conditions))
+        both = Query(tuple(clause for query in conditions for clause in query.clauses))
         return _step(both, StepRole(verb, GRIPPER, point, manner, way, confidence=0.0))
 
     # Complete a pull as a grasp, which also holds objects that the fingers cannot hook.
@@ -303,7 +305,7 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
             by_hand("approach", "grasp", _negated(above), away),
             by_hand("descend", "grasp", above, away),
             by_hand("close", "grasp", near, _gripper_is("open")),
-            _step(Query(all_of((near.expression, _gripper_is("closed").expression))), motion),
+            _step(Query((*near.clauses, *_gripper_is("closed").clauses)), motion),
         )
     way, motion = motion.direction, replace(motion, target=point)
     if motion.manner == "press":

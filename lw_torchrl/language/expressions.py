@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from dataclasses import dataclass
 from threading import Lock
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 from weakref import WeakValueDictionary
 
 Kind = Literal["leaf", "all", "any"]
@@ -22,8 +21,7 @@ class _Node:
         self.leaf, self.parts = leaf, parts
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class Expression:
+class Expression(NamedTuple):
     """A boolean expression: a leaf, its negation, or a conjunction or disjunction of expressions.
 
     :func:`all_of`, :func:`any_of` and :func:`negate` make expressions in normal form. Only leaves are negated; no part
@@ -42,23 +40,23 @@ class Expression:
         True
     """
 
-    _node: _Node  # a disjunction is stored as the negation of a conjunction
+    node: _Node  # a disjunction is stored as the negation of a conjunction
     negated: bool
 
     @property
     def kind(self) -> Kind:
         """The kind: a leaf (negated if :attr:`negated`), or a conjunction ("all") or disjunction ("any") of parts."""
-        return "leaf" if self._node.parts is None else "any" if self.negated else "all"
+        return "leaf" if self.node.parts is None else "any" if self.negated else "all"
 
     @property
     def leaf(self) -> Any:
         """The value of a leaf, without its negation."""
-        return self._node.leaf
+        return self.node.leaf
 
     @property
     def parts(self) -> tuple[Expression, ...]:
         """The parts of a conjunction or disjunction; a leaf has none."""
-        parts = self._node.parts or ()
+        parts = self.node.parts or ()
         return tuple(map(negate, parts)) if self.negated else parts
 
     def __str__(self) -> str:
@@ -110,7 +108,7 @@ def as_expression(value: Any) -> Expression:
 def negate(value: Any) -> Expression:
     """Return the negation of an expression or leaf."""
     expression = as_expression(value)
-    return Expression(expression._node, not expression.negated)
+    return Expression(expression.node, not expression.negated)
 
 
 def all_of(parts: Iterable[Any]) -> Expression:
@@ -130,15 +128,17 @@ def all_of(parts: Iterable[Any]) -> Expression:
     either = [part for part in distinct if part.kind == "any"]
     if any(negate(part) in distinct for part in distinct):
         return FALSE
-    if any(distinct.keys() >= {*negate(part).parts} for part in either):
-        return FALSE
-    for part in either:
-        if not distinct.keys().isdisjoint(part.parts):  # "a and (a or b)" is "a"
-            del distinct[part]
+    if any(all(other in distinct for other in part.node.parts or ()) for part in either):
+        return FALSE  # "a and b and not (a and b)"
+    if either:
+        negations = {negate(part) for part in distinct}
+        for part in either:
+            if not negations.isdisjoint(part.node.parts or ()):  # "a and (a or b)" is "a"
+                del distinct[part]
     if len(distinct) == 1:
         return next(iter(distinct))
     # The key names parts by id, so that it does not keep them alive; the node does, as long as it exists.
-    key = tuple((id(part._node), part.negated) for part in distinct)
+    key = tuple((id(part.node), part.negated) for part in distinct)
     return Expression(_shared(key, None, tuple(distinct)), False)
 
 

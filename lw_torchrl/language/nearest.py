@@ -20,7 +20,6 @@ from lw_torchrl.language.queries import (
     Query,
     QueryError,
     base_clauses,
-    check_length,
     read_query,
     split_words,
 )
@@ -63,6 +62,11 @@ class QueryMatch:
     score: float  # mean score of the parts, in [0, 1]; 1 if the text is a query
     parts: tuple[QueryPart, ...]  # the match of each clause of the text
 
+    @property
+    def least_score(self) -> float:
+        """The smallest score of a part."""
+        return min(part.score for part in self.parts)
+
 
 @typed
 def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] = "edit") -> QueryMatch:
@@ -89,26 +93,29 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
     """
     owner = get_task(task)
     if (query := read_query(text, owner)) is not None:
-        return QueryMatch(query, 1.0, tuple(QueryPart(str(clause), Query((clause,)), 1.0) for clause in query.clauses))
+        parts = [QueryPart(str(clause), Query((clause,)), 1.0) for clause in query.clauses]
+        return QueryMatch(query, 1.0, tuple(parts or [QueryPart(text, query, 1.0)]))
     pieces = [" ".join(piece.split()) for piece in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]
-    pieces = [piece for piece in pieces if _content(_affirmed(piece)[0])] or [" ".join(text.split())]
+    pieces = [piece for piece in pieces if _content(_affirmed(piece)[0])]
+    if not pieces:
+        part = _nearest_part(" ".join(text.split()), owner, by)
+        return QueryMatch(part.query, part.score, (part,))
     words = split_words(" and ".join(pieces))
-    check_length(text, words)
     # Spaces hide other words such as "or" from the parser.
     conjunction = _nearest_match([word for piece in pieces for word in ("and", f" {piece}")][1:], owner, by)
-    if not _JOINS.intersection(word.casefold() for word in words):
+    assert conjunction is not None  # each piece is an operand
+    if not _JOINS.intersection(map(str.casefold, words)):
         return conjunction
     try:
         match = _nearest_match(words, owner, by)
     except QueryError:  # a stray parenthesis
         match = _nearest_match([word for word in words if word not in "()"], owner, by)
     # "at or near the puck" does not consist of two conditions.
-    worst, least = (min(part.score for part in each.parts) for each in (conjunction, match))
-    return match if least >= min(worst, 1.0 - LIMIT) else conjunction
+    return conjunction if match is None or match.least_score < conjunction.least_score else match
 
 
-def _nearest_match(words: list[str], task: Task, by: str) -> QueryMatch:
-    """Match each operand among words that :func:`parse_words` accepts."""
+def _nearest_match(words: list[str], task: Task, by: str) -> QueryMatch | None:
+    """Match each operand among words that :func:`parse_words` accepts; return None without any operand."""
     known: dict[tuple[str, str], QueryPart] = {}  # a cache, since parts often repeat
     parts: list[QueryPart] = []
     subject = ""
@@ -129,10 +136,12 @@ def _nearest_match(words: list[str], task: Task, by: str) -> QueryMatch:
         return parts[-1].query.expression
 
     expression = parse_words(words, nearest, lambda *_: QueryError("stray parenthesis"))
-    if expression is None:  # a text without content
-        parts.append(_nearest_part(" ".join(" ".join(words).split()), task, by))
-        expression = parts[0].query.expression
-    return QueryMatch(Query(expression), sum(part.score for part in parts) / len(parts), tuple(parts))
+    if expression is None:
+        return None
+    query = Query(expression)
+    if all(part.query.is_conjunction for part in parts) and not _JOINS.intersection(map(str.casefold, words)):
+        query = Query(tuple(clause for part in parts for clause in part.query.clauses))  # spelled as it was given
+    return QueryMatch(query, sum(part.score for part in parts) / len(parts), tuple(parts))
 
 
 def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
@@ -258,7 +267,7 @@ def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
     with suppress(QueryError):
         match = nearest_query(words, task)
         if len(match.parts) <= _MOST_CLAUSES:
-            return match.query, 1.0 - min(part.score for part in match.parts)
+            return match.query, 1.0 - match.least_score
     return None, 1.0
 
 

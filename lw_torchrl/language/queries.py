@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import permutations
 
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._util.checks import typed
-from lw_torchrl.language.connectives import parse_words
+from lw_torchrl.language.connectives import CONNECTIVES, parse_words
 from lw_torchrl.language.expressions import (
     FALSE,
     TRUE,
@@ -32,6 +32,7 @@ from lw_torchrl.language.tasks import Task, get_task
 
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
+_OTHERS = frozenset(("(", *CONNECTIVES)) - {"and"}
 _MOST_CLAUSES = 256  # in the text of a query
 
 
@@ -49,44 +50,50 @@ class Clause:
         return words if self.object is None else f"{words} the {self.object}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Query:
     """A condition: a boolean expression over clauses. ``str(query)`` is the canonical spelling.
 
-    Queries are equal if their expressions have the same normal form.
+    Queries are equal if their expressions have the same normal form. A conjunction is spelled as it was given, with
+    repeated clauses.
 
     Args:
-        expression: an expression over clauses (:mod:`lw_torchrl.language.expressions`); or clauses that must all be
-            true.
+        expression: an expression over clauses (:mod:`lw_torchrl.language.expressions`); or a tuple of clauses that must
+            all be true.
 
     Example:
         >>> str(parse_query("Is the gripper open and not above the puck?", task="pick-place"))
         "the robot's gripper is open and the robot's gripper is not above the puck"
-        >>> query = parse_query("the gripper is neither open nor (near the puck unless above the puck)", task="push")
-        >>> print(query)
-        the robot's gripper is not open and (the robot's gripper is not near the puck or the robot's gripper is above the puck)
+        >>> print(parse_query("either the gripper is open or the puck is not near the target location", task="push"))
+        the robot's gripper is open or the puck is not near the target location
     """
 
     expression: Expression
+    _given: tuple[Clause, ...] = field(default=(), init=False, compare=False, repr=False)
 
-    def __post_init__(self) -> None:
-        given = self.expression if isinstance(self.expression, Expression) else all_of(self.expression)
-        positive = replace_leaves(given, _without_negation) if any(leaf.negated for leaf in leaves(given)) else given
-        object.__setattr__(self, "expression", positive)
+    def __init__(self, expression: Expression | tuple[Clause, ...]) -> None:
+        if not isinstance(expression, Expression):
+            object.__setattr__(self, "_given", tuple(expression))
+            expression = all_of(expression)
+        if any(clause.negated for clause in leaves(expression)):
+            expression = replace_leaves(expression, _without_negation)
+        object.__setattr__(self, "expression", expression)
 
     def __str__(self) -> str:
+        if self._given:
+            return " and ".join(map(str, self._given))
         return write(self.expression, lambda clause, negated: str(replace(clause, negated=negated)))
 
     @property
     def is_conjunction(self) -> bool:
         """True for a clause or a conjunction of clauses: a query without "or"."""
         parts = self.expression.parts
-        return self.expression.kind != "any" and all(part.kind == "leaf" for part in parts)
+        return bool(self._given) or (self.expression.kind != "any" and all(part.kind == "leaf" for part in parts))
 
     @cached_property
     def clauses(self) -> tuple[Clause, ...]:
-        """The distinct clauses that the query mentions, in order; for a conjunction, the clauses that must be true."""
-        return tuple(map(_as_clause, literals(self.expression)))
+        """The clauses that the query mentions, in order; for a conjunction, the clauses that must all be true."""
+        return self._given or tuple(map(_as_clause, literals(self.expression)))
 
     @cached_property
     def implied(self) -> tuple[Clause, ...]:
@@ -107,15 +114,29 @@ class QueryError(ValueError):
     """The error for a text that is not a query about the objects of its task."""
 
 
-def check_length(text: str, words: Sequence[str]) -> None:
-    """Raise a QueryError if a text has more clauses than a query may have."""
-    if (clauses := 1 + sum(word.casefold() in ("and", "or", "nor", "unless") for word in words)) > _MOST_CLAUSES:
-        raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {clauses}")
-
-
 def split_words(text: str) -> list[str]:
-    """Split a text into words and parentheses."""
-    return re.findall(r"[()]|[^\s()]+", text)
+    """Split a text into words and parentheses. "not above or near the puck" becomes "not (above the puck or near the
+    puck)".
+
+    Raises:
+        QueryError: the text has more clauses than a query may have.
+    """
+    words = re.findall(r"[()]|[^\s()]+", text)
+    clauses = 1 + sum(word.casefold() in ("and", "or", "nor", "unless") for word in words)
+    if clauses > _MOST_CLAUSES:
+        raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {clauses}")
+    spaced, pattern = " ".join(words), _two_relations(tuple(RELATIONS))
+    if pattern.search(spaced) is None:
+        return words
+    return re.findall(r"[()]|[^\s()]+", pattern.sub(r"(\1 \4 \2 \3 \4)", spaced))
+
+
+@lru_cache(maxsize=16)
+def _two_relations(names: tuple[str, ...]) -> re.Pattern[str]:
+    """Compile a pattern that matches two relations to one object."""
+    relation = "|".join(map(re.escape, sorted(names, key=len, reverse=True)))
+    word = r"(?!(?:and|or|nor|unless|is|isn't)\b)[^\s()]+"
+    return re.compile(rf"\b({relation}) (and|or) ({relation}) ({word}(?: {word})*)", re.IGNORECASE)
 
 
 @lru_cache(maxsize=256)
@@ -275,16 +296,13 @@ def read_query(text: str, task: Task) -> Query | None:
 
 def _parse(text: str, task: Task, explain: bool) -> Query:
     words = split_words(text.replace("’", "'").casefold().strip().strip(" ?.!"))
-    check_length(text, words)
-    subject: str | None = None
+    clauses: list[Clause] = []
 
     def clause(operand: list[str]) -> Expression:
-        nonlocal subject
         if operand in (["always"], ["never"]):
             return TRUE if operand == ["always"] else FALSE
-        parsed = _ClauseParser(operand, task, text, explain).parse(subject)
-        subject = parsed.subject
-        return _without_negation(parsed)
+        clauses.append(_ClauseParser(operand, task, text, explain).parse(clauses[-1].subject if clauses else None))
+        return _without_negation(clauses[-1])
 
     def fail(number: int, expected: str) -> QueryError:
         parser = _ClauseParser(words, task, text, explain)
@@ -293,7 +311,8 @@ def _parse(text: str, task: Task, explain: bool) -> Query:
 
     expression = parse_words(words, clause, fail)
     assert expression is not None  # every operand is a clause or an error
-    return Query(expression)
+    is_plain = len(clauses) == 1 + words.count("and") and not _OTHERS.intersection(words)
+    return Query(tuple(clauses) if is_plain else expression)
 
 
 def check_query(query: str | Query, task: str | Task) -> Query:
@@ -301,7 +320,7 @@ def check_query(query: str | Query, task: str | Task) -> Query:
     if not isinstance(query, Query):
         return parse_query(query, task)
     owner = get_task(task)
-    if (clauses := count_mentions(query.expression)) > _MOST_CLAUSES:
+    if (clauses := max(len(query.clauses), count_mentions(query.expression))) > _MOST_CLAUSES:
         raise QueryError(f"a query must have at most {_MOST_CLAUSES} clauses when it is written, got {clauses}")
     if all(_is_of(clause, owner) for clause in query.clauses):
         return query

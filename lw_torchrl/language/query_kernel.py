@@ -10,7 +10,7 @@ from numba import njit
 @njit(cache=True, nogil=True, error_model="numpy")
 def answer(
     observation: Any, task_id: Any, ids: Any, row_of: Any, ends: Any, places: Any, metres: Any, bit: Any, flipped: Any,
-    conjunction: Any, care: Any, want: Any, constants: Any, truth: Any,
+    gates: Any, care: Any, want: Any, constants: Any, truth: Any,
 ) -> bool:  # fmt: skip
     """Write each row's query results to ``truth`` (B, S) bool, with QueryProgram's operations in the same order.
 
@@ -50,8 +50,8 @@ def answer(
             facts |= np.uint64(coordinate < metres[a, 4]) << bit[a]
         facts ^= flipped[t]
         for c in range(ends[t, 3], ends[t, 4]):
-            if facts & conjunction[c, 0] == conjunction[c, 0]:
-                facts |= conjunction[c, 1]
+            if facts & gates[c, 0] == gates[c, 1]:
+                facts |= gates[c, 2]
         for q in range(care.shape[1]):
             truth[b, q] = facts & care[t, q] == want[t, q]
     return finite

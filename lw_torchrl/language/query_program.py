@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache, reduce
+from functools import cache
 from numbers import Real
+from typing import Literal
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 
 from lw_torchrl._util.checks import check_choice, check_value, shown
 from lw_torchrl._util.devices import check_finite
+from lw_torchrl.language.gates import Gates, Truth, evaluate_gates
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.query_tables import QueryTables, compile_facts, compile_queries
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
@@ -73,7 +75,7 @@ class QueryProgram(nn.Module):
         self.num_queries = max(map(len, compiled.values()))
         index = TaskIndex(task_ids(self.tasks))
         in_order = dict(sorted(compiled.items(), key=lambda item: index.row(item[0].name)))
-        tables = compile_queries(in_order)
+        tables, self._shapes = compile_queries(in_order)
         self._any_far = bool(tables.far.any())
         self._tables = TaskTables(index, tables, f"tasks without queries in {self!r}")
         facts = compile_facts(in_order)
@@ -101,37 +103,48 @@ class QueryProgram(nn.Module):
         check_finite("observation", observation)
         tables = self._tables.select(task_id.reshape(-1), observation)
         atoms = (self._values(observation, tables) < tables.threshold) ^ tables.flipped
-        # A logical AND of a few tensors is far faster than all() over a short axis.
-        clauses = reduce(torch.logical_and, self._parts(atoms, tables)) ^ tables.negated
-        return reduce(torch.logical_and, clauses.unbind(1)).reshape(*task_id.shape, self.num_queries)
+        return self._combine(atoms, tables, "exact").reshape(*task_id.shape, self.num_queries)
 
-    def logits(self, observation: Tensor, task_id: Tensor, *, temperature: float = 1.0) -> Tensor:
+    def logits(
+        self,
+        observation: Tensor,
+        task_id: Tensor,
+        *,
+        temperature: float = 1.0,
+        truth: Literal["min-max", "product"] = "min-max",
+    ) -> Tensor:
         """Return soft truth values: each query's margin as a logit, differentiable in the observation.
 
         A comparison's margin is its distance to the threshold, divided by its temperature (see
-        :class:`~lw_torchrl.language.relations.Comparison`). A conjunction has the smallest margin of its operands, a
-        negation the negative margin. The logit is positive if the query is true, otherwise negative, and never zero.
-        The gradient is finite, and equals the gradient of the comparison with the smallest margin.
+        :class:`~lw_torchrl.language.relations.Comparison`). A clause has the smallest margin of its comparisons, a
+        negation the negative margin. With "min-max", a conjunction has the smallest margin of its operands, a
+        disjunction the largest: the logit is positive if the query is true, otherwise negative, and never zero, and its
+        gradient is the gradient of the comparison that decides. With "product", the operands are independent
+        statements, whose probabilities are the sigmoids of their logits: every operand has a gradient, and a true query
+        may have a negative logit near a threshold. Gradients are finite.
 
         Args:
             observation, task_id: as for :meth:`forward`.
             temperature: a factor on every comparison's temperature, between 1e-6 and 1e6.
+            truth: how the operands of "and" and "or" are combined, "min-max" or "product".
 
         Returns:
             (..., S) float32 logits on the observation's device, with magnitudes from 1e-6 to 1e4; padding is -1e4.
         """
         if not isinstance(temperature, Real) or not 1e-6 <= temperature <= 1e6:  # a check that torch.compile can trace
             raise ValueError(f"temperature must be between 1e-6 and 1e6, got {temperature!r}")
-        truth = self(observation.detach(), task_id)
+        check_choice("truth", truth, ("min-max", "product"))
+        exact = self(observation.detach(), task_id)
         state = observation if observation.dtype in _COMPILED else observation.float()
         state = state.clamp(-_MOST, _MOST)  # squares of larger numbers overflow
         tables = self._tables.select(task_id.reshape(-1), state)
         margin = (tables.threshold - self._values(state, tables, floor=_LEAST)) / tables.temperature / temperature
-        clause = reduce(torch.minimum, self._parts(torch.where(tables.flipped, -margin, margin), tables))
-        soft = torch.where(tables.negated, -clause, clause).amin(1).float().reshape(truth.shape)
-        size = torch.where(truth, soft, -soft).detach().clamp(_LEAST, _MOST)
+        soft = self._combine(torch.where(tables.flipped, -margin, margin), tables, truth).float().reshape(exact.shape)
+        if truth == "product":
+            return soft.clamp(-_MOST, _MOST)
+        size = torch.where(exact, soft, -soft).detach().clamp(_LEAST, _MOST)
         # The value has the sign of the hard truth, even exactly on a threshold; the gradient is the gradient of soft.
-        return soft - soft.detach() + torch.where(truth, size, -size)
+        return soft - soft.detach() + torch.where(exact, size, -size)
 
     def _kernel(self, observation: Tensor, task_id: Tensor) -> Callable[..., bool] | None:
         """Return the kernel if it supports these tensors; else None."""
@@ -150,9 +163,9 @@ class QueryProgram(nn.Module):
             self._tables.select(task_id.reshape(-1), observation)  # either this call or the one above raises
         return torch.from_numpy(truth.reshape(*task_id.shape, self.num_queries))
 
-    def _parts(self, atoms: Tensor, tables: QueryTables) -> tuple[Tensor, ...]:
-        """Gather the J atoms of each clause, J tensors (B, K, S), from all atoms (B, A)."""
-        return atoms.gather(1, tables.atoms).unflatten(1, (-1, *tables.negated.shape[1:])).unbind(1)
+    def _combine(self, atoms: Tensor, tables: QueryTables, truth: Truth) -> Tensor:
+        """Return the truth or the logits (B, S) of queries from those of all atoms (B, A)."""
+        return evaluate_gates(atoms, Gates(tables.inputs, tables.negated, self._shapes), truth)
 
     def _values(self, observation: Tensor, tables: QueryTables, floor: float = 0.0) -> Tensor:
         """Return each atom's value (B, A) in metres; ``floor`` is the minimum length, since 0 has no gradient."""

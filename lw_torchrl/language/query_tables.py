@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lw_torchrl.language.expressions import FALSE, Expression, leaves, negate
+from lw_torchrl.language.gates import Operand, Shapes, compile_gates, inner_gates
 from lw_torchrl.language.objects import TypedPosition, coordinate_indices, typed_position
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import STATES, Comparison, comparisons
@@ -58,9 +61,8 @@ class Atom(NamedTuple):
 
 _ORIGIN = typed_position((0.0, 0.0, 0.0))
 _NO_SHIFT = (0.0, 0.0, 0.0)
-# Padding atoms compare the origin with itself; their truth never changes, and their margins are extreme.
+# The padding atom compares the origin with itself; it is always true, and its margin is extreme.
 _ALWAYS = Atom(_ORIGIN, _ORIGIN, _NO_SHIFT, Comparison("xyz", "<", 1e4, temperature=1e-6))
-_NEVER = Atom(_ORIGIN, _ORIGIN, _NO_SHIFT, Comparison("xyz", "<", -1e4, temperature=1e-6))
 
 
 def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
@@ -80,7 +82,7 @@ def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
 
 
 class QueryTables(NamedTuple):
-    """Tensors that encode queries: the A atoms of each task and, for each of its S queries, K clauses of J atoms each.
+    """Tensors that encode queries: the A atoms of each task, and the gates that make S queries of them.
 
     The first dimension is the tasks (T), or the rows of the batch (B) in tables that were selected for a batch.
     """
@@ -93,27 +95,34 @@ class QueryTables(NamedTuple):
     threshold: Tensor  # (T, A) float64, metres; an atom is true where its value is below
     flipped: Tensor  # (T, A) bool, negate the atom
     temperature: Tensor  # (T, A) float64, metres per logit
-    atoms: Tensor  # (T, J*K*S) int64, indices into the atoms
-    negated: Tensor  # (T, K, S) bool, negate the clause
+    inputs: Tensor  # (T, N) int64, see Gates
+    negated: Tensor  # (T, M) bool, see Gates
     constants: Tensor  # (T, C) float64, indexed as if they followed the observation
 
 
-def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
-    """Compile the queries of tasks to tables with one row per task, in the order of the mapping."""
-    steps = max(map(len, queries.values()))
-    width = max(len(query.clauses) for listed in queries.values() for query in listed)
-    compiled = [_task_atoms(task, listed, steps, width) for task, listed in queries.items()]
-    most = max(len(atoms) for atoms, _, _ in compiled)
-    parts = max(2, *(len(each) for _, places, _ in compiled for row in places for each in row))
-    padded = [[[[*each, *[0] * (parts - len(each))] for each in row] for row in places] for _, places, _ in compiled]
-    listed = [atoms + [_ALWAYS] * (most - len(atoms)) for atoms, _, _ in compiled]
+def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> tuple[QueryTables, Shapes]:
+    """Compile the queries of tasks to tables, one row per task in the order of the mapping, and the shapes of gates."""
+    expressions = [[query.expression for query in listed] for listed in queries.values()]
+    atoms_of = [
+        {clause: clause_atoms(clause, task) for query in listed for clause in leaves(query.expression)}
+        for task, listed in queries.items()
+    ]
+    compiled = [list(dict.fromkeys([_ALWAYS, *chain(*own.values())])) for own in atoms_of]
+    most = max(map(len, compiled))
+
+    def operand(own: dict[Clause, list[Atom]], place: dict[Atom, int]) -> Callable[[Expression], Operand]:
+        return lambda literal: ([place[atom] for atom in own[literal.leaf]], literal.negated)
+
+    places = [{atom: number for number, atom in enumerate(atoms)} for atoms in compiled]
+    gates = compile_gates(expressions, list(map(operand, atoms_of, places)), most, true=0)
+    listed = [atoms + [_ALWAYS] * (most - len(atoms)) for atoms in compiled]
     constants, size = [0.0], one_layout(queries).size
 
     def table(value: Callable[[Atom], Any], dtype: torch.dtype = torch.int64) -> Tensor:
         values = torch.tensor([[value(atom) for atom in atoms] for atoms in listed], dtype=dtype)
         return values.movedim(1, -1).contiguous()
 
-    return QueryTables(
+    tables = QueryTables(
         first=table(lambda atom: atom.coordinates(0, constants, size)).flatten(1),
         second=table(lambda atom: atom.coordinates(1, constants, size)).flatten(1),
         shift=table(lambda atom: atom.offset, torch.float64),
@@ -122,23 +131,11 @@ def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
         threshold=table(lambda atom: atom.threshold, torch.float64),
         flipped=table(lambda atom: atom.flipped, torch.bool),
         temperature=table(lambda atom: atom.part.temperature, torch.float64),
-        atoms=torch.tensor(padded).permute(0, 3, 2, 1).flatten(1),
-        negated=torch.tensor([negated for _, _, negated in compiled]).transpose(1, 2).contiguous(),
+        inputs=gates.inputs,
+        negated=gates.negated,
         constants=torch.tensor([constants] * len(listed), dtype=torch.float64),
     )
-
-
-def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[Atom], list, list]:
-    """Return a task's distinct atoms, the atom indices of each clause (steps, width, J), and whether each clause is
-    negated.
-    """
-    clauses = [[(clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
-    clauses += [[([_NEVER], False)]] * (steps - len(queries))
-    padded = [[*listed, *[([], False)] * (width - len(listed))] for listed in clauses]
-    atoms = dict.fromkeys([_ALWAYS, *(atom for listed in padded for group, _ in listed for atom in group)])
-    place = {atom: number for number, atom in enumerate(atoms)}
-    places = [[[place[atom] for atom in group] for group, _ in row] for row in padded]
-    return list(atoms), places, [[negated for _, negated in row] for row in padded]
+    return tables, gates.shapes
 
 
 MOST_FACTS = 63  # maximum number of facts of a task; the last of the 64 bits is never set
@@ -149,18 +146,18 @@ Bits = NDArray[np.uint64]
 class QueryFacts(NamedTuple):
     """The facts (F) of all tasks as bits, one task after another.
 
-    A task's facts are its length comparisons, single-coordinate comparisons and conjunctions (D). A query
-    is true if ``facts & care == want``, where ``care`` masks the bits that the query depends on.
+    A task's facts are its length comparisons, single-coordinate comparisons and gates (D). A gate or a query
+    is true if ``facts & care == want``, where ``care`` masks the bits that it depends on.
     """
 
     ids: NDArray[np.int64]  # (T,), task ids, ascending
     row_of: NDArray[np.int64]  # (50,), the row of each Meta-World task; -1 for a task without queries
-    ends: Bits  # (T, 5): first length, first coordinate, end of coordinates, first conjunction, end of conjunctions
+    ends: Bits  # (T, 5): first length, first coordinate, end of coordinates, first gate, end of gates
     places: Bits  # (F, 6), indices of x, x, y, y, z, z of the two positions; a coordinate uses only the first two
     metres: NDArray[np.floating[Any]]  # (F, 5): the shift along x, y and z, the length's sign, the threshold
     bit: Bits  # (F,), the bit number of each fact
     flipped: Bits  # (T,), the bits to negate
-    conjunction: Bits  # (D, 2): the bits that must all be set, and the bit that is then set
+    gates: Bits  # (D, 3): care, want, and the bit to set if the gate is true; a gate depends on bits of earlier ones
     care: Bits  # (T, S), the bits that each query depends on
     want: Bits  # (T, S), the required values of these bits
     constants: NDArray[np.floating[Any]]  # (C,), indexed as if they followed the observation
@@ -170,28 +167,42 @@ class QueryFacts(NamedTuple):
         return self._replace(metres=self.metres.astype(dtype), constants=self.constants.astype(dtype))
 
 
-def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], dict[int, int], list[tuple[int, int]]]:
-    """Return the bit number of each atom, the bit of each conjunction, and each query's (care, want) bits."""
+Condition = tuple[int, int]  # (care, want)
+
+
+def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], dict[Condition, int], list[Condition]]:
+    """Return the bit number of each atom, the bit of each gate, and each query's (care, want) bits."""
+    expressions = [query.expression for query in queries]
     places: dict[Atom, int] = {}
+    bits: dict[Clause, int] = {}
+    # Number all atoms first, since the bits of gates follow the bits of atoms.
+    for clause in dict.fromkeys(chain(*map(leaves, expressions))):
+        bits[clause] = sum({1 << places.setdefault(atom, len(places)) for atom in clause_atoms(clause, task)})
+    gates: dict[Condition, int] = {}
 
-    def bits(clause: Clause) -> int:
-        return sum({1 << places.setdefault(atom, len(places)) for atom in clause_atoms(clause, task)})
+    def gate(condition: Condition) -> int:
+        return gates.setdefault(condition, 1 << len(places) + len(gates))
 
-    # Number all atoms first, since the bits of conjunctions follow the bits of atoms.
-    listed = [[(bits(clause), clause.negated) for clause in query.clauses] for query in queries]
-    conjunctions: dict[int, int] = {}
-    literals = []
-    for clauses in listed:
+    def conjunction(parts: Sequence[Expression]) -> Condition:
         true = false = 0
-        for together, negated in clauses:
-            if not negated:
-                true |= together
-            elif together.bit_count() == 1:
-                false |= together
+        for part in parts:
+            if part.kind == "any":
+                false |= inner[negate(part)]
+            elif not part.negated:
+                true |= bits[part.leaf]
             else:
-                false |= conjunctions.setdefault(together, 1 << len(places) + len(conjunctions))
-        literals.append((_FALSE, _FALSE) if true & false else (true | false, true))
-    return places, conjunctions, literals
+                together = bits[part.leaf]
+                false |= together if together.bit_count() == 1 else gate((together, together))
+        return (_FALSE, _FALSE) if true & false else (true | false, true)
+
+    inner: dict[Expression, int] = {}
+    for each in inner_gates(expressions):
+        inner[each] = gate(conjunction(each.parts))
+    conditions = [
+        (_FALSE, _FALSE) if each == FALSE else conjunction(each.parts if each.kind == "all" else [each])
+        for each in expressions
+    ]
+    return places, gates, conditions
 
 
 def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
@@ -206,7 +217,7 @@ def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
         return None
     constants, size = [0.0], one_layout(queries).size
     places: list[list[int]] = []
-    conjunctions: list[tuple[int, int]] = []
+    gates: list[tuple[int, int, int]] = []
     ends, metres, bits, flipped = [], [], [], []
     for atoms, together, _ in tasks:
         begin = len(places)
@@ -218,12 +229,14 @@ def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
             bits.append(atoms[atom])
         lengths = sum(atom.part.length for atom in atoms)
         flipped.append(sum(1 << bit for atom, bit in atoms.items() if atom.flipped))
-        ends.append([begin, begin + lengths, len(places), len(conjunctions), len(conjunctions) + len(together)])
-        conjunctions += together.items()
+        ends.append([begin, begin + lengths, len(places), len(gates), len(gates) + len(together)])
+        gates += [(care, want, bit) for (care, want), bit in together.items()]
     steps = max(len(literals) for *_, literals in tasks)
     padded = [literals + [(_FALSE, _FALSE)] * (steps - len(literals)) for *_, literals in tasks]
     care, want = np.moveaxis(np.array(padded, np.uint64), 2, 0)
     tables = {"ends": ends, "places": places, "bit": bits, "flipped": flipped, "care": care, "want": want}
     facts = {name: np.array(table, np.uint64, order="C") for name, table in tables.items()}
-    facts["conjunction"] = np.array(conjunctions, np.uint64).reshape(-1, 2)
-    return QueryFacts(ids=np.array(ids), row_of=row_of, metres=np.array(metres), constants=np.array(constants), **facts)
+    facts["places"] = facts["places"].reshape(-1, 6)  # also if there are no atoms
+    facts["gates"] = np.array(gates, np.uint64).reshape(-1, 3)
+    lengths_of = np.array(metres, np.float64).reshape(-1, 5)
+    return QueryFacts(ids=np.array(ids), row_of=row_of, metres=lengths_of, constants=np.array(constants), **facts)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from inspect import signature
 from math import sqrt
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -17,6 +18,8 @@ from torchrl.modules import MLP
 
 from lw_torchrl._util.checks import Count, check_choice, shown, typed, unknown_name
 from lw_torchrl._util.keys import dispatched, key_beside, read, write
+from lw_torchrl.language.expressions import Expression
+from lw_torchrl.language.gates import Gates, Operand, Shapes, compile_gates, evaluate_gates
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.queries import Clause
 from lw_torchrl.language.relations import PREDICATES, STATES
@@ -166,23 +169,14 @@ class Clauses(NamedTuple):
     negated: Tensor  # (...) bool
     subject: Tensor  # (...) int64, an index into the list of names
     object: Tensor  # (...) int64, likewise; the number of names for a clause without an object
-    # Only for clauses (T, C) of the plans of T tasks, where each distinct clause of a plan is listed once:
-    parts: Tensor = torch.empty(0)  # (T, S, K) int64, indices of the clauses of each condition
-    mask: Tensor = torch.empty(0)  # (T, S, K) bool, true where there is such a clause
+    # Only for clauses (T, C) of the plans of T tasks, where each distinct clause of a plan is listed once: the gates
+    # that make conditions of the clauses and of a value that is always true, number C; see Gates.
+    inputs: Tensor = torch.empty(0, dtype=torch.int64)
+    flipped: Tensor = torch.empty(0, dtype=torch.bool)
 
     def pick(self, which: Tensor) -> Clauses:
         """Return the clauses (...) at indices ``which`` (...) int64 of these clauses (G,)."""
         return Clauses(*(table[which] for table in self[:7]))
-
-
-def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
-    """Return the logit (...) of the conjunction of statements with logits (..., K) where ``mask`` (..., K) is true.
-
-    The statements are assumed to be independent, so p is the product of their probabilities sigmoid(l), and its logit
-    is -log(expm1(sum(softplus(-l)))). The result is at most 30, and is 30 if ``mask`` is all false.
-    """
-    doubt = torch.where(mask, nn.functional.softplus(-logits), 0.0).sum(-1).clamp(min=1e-13)
-    return -(doubt + torch.log(-torch.expm1(-doubt)))
 
 
 class ClauseEvaluator(QueryEvaluator):
@@ -190,8 +184,9 @@ class ClauseEvaluator(QueryEvaluator):
 
     Reads a view of a state, such as an observation or pictures, and ``task_id``; writes the keys of
     :class:`QueryEvaluator`, with logits of -1e4 beyond a plan's last step. The network answers single clauses, which
-    :func:`conjunction` combines. A subclass sets ``network``, which maps views of B states and their clauses (B, C) to
-    logits (B, C), and ``seen_dims``, the number of dimensions of a view.
+    the plans' conditions combine as independent statements: P(A and B) = P(A) P(B), and
+    P(A or B) = 1 - P(not A) P(not B). Gradients reach every clause. A subclass sets ``network``, which maps views of B
+    states and their clauses (B, C) to logits (B, C), and ``seen_dims``, the number of dimensions of a view.
 
     Args:
         plans, answers: see :class:`QueryEvaluator`.
@@ -203,6 +198,7 @@ class ClauseEvaluator(QueryEvaluator):
     """
 
     network: nn.Module
+    shapes: Shapes
     seen_dims: ClassVar[int] = 1
 
     def __init__(
@@ -236,8 +232,8 @@ class ClauseEvaluator(QueryEvaluator):
         rows = seen.reshape(-1, *seen.shape[-self.seen_dims :])
         tables = self.tables.select(task_id.reshape(-1), rows)
         clauses = self.network(rows, tables)
-        parts = clauses.gather(-1, tables.parts.flatten(1)).reshape(tables.parts.shape)
-        logits = torch.where(tables.mask.any(-1), conjunction(parts, tables.mask), _PADDING)
+        values = torch.cat((clauses, torch.full_like(clauses[..., :1], -_PADDING)), -1)
+        logits = evaluate_gates(values, Gates(tables.inputs, tables.flipped, self.shapes), "product")
         return logits.reshape(*task_id.shape, self.plans.num_steps)
 
     def code(self, clauses: Sequence[tuple[Task, Clause]]) -> Clauses:
@@ -269,20 +265,30 @@ class ClauseEvaluator(QueryEvaluator):
         plans = [self.plans[task] for task in tasks]
         # The distinct clauses of each plan, in the order of the steps.
         by_plan = [list(dict.fromkeys(c for step in plan.steps for c in step.condition.clauses)) for plan in plans]
-        width = max(len({*step.condition.clauses}) for plan in plans for step in plan.steps)
-        number = torch.zeros(len(tasks), max(map(len, by_plan)), dtype=torch.int64)
-        parts = torch.zeros(len(tasks), self.plans.num_steps, width, dtype=torch.int64)
-        mask = torch.zeros(len(tasks), self.plans.num_steps, width, dtype=torch.bool)
-        start = 0
-        for row, (plan, clauses) in enumerate(zip(plans, by_plan, strict=True)):
+        most, start = max(map(len, by_plan)), 0
+        if not most:
+            raise ValueError("plans must have a condition with a clause, got only 'always' and 'never'")
+        number = torch.zeros(len(tasks), most, dtype=torch.int64)
+        for row, clauses in enumerate(by_plan):
             number[row, : len(clauses)] = torch.arange(start, start + len(clauses))
             start += len(clauses)
-            for column, step in enumerate(plan.steps):
-                which = [clauses.index(clause) for clause in dict.fromkeys(step.condition.clauses)]
-                parts[row, column, : len(which)] = torch.tensor(which)
-                mask[row, column, : len(which)] = True
+
+        def operands(clauses: list[Clause]) -> Callable[[Expression], Operand]:
+            places = {clause: place for place, clause in enumerate(clauses)}
+
+            def operand(literal: Expression) -> Operand:
+                clause = replace(literal.leaf, negated=literal.negated)
+                if clause in places:
+                    return (places[clause],), False
+                return (places[replace(clause, negated=not clause.negated)],), True
+
+            return operand
+
+        conditions = [[step.condition.expression for step in plan.steps] for plan in plans]
+        gates = compile_gates(conditions, list(map(operands, by_plan)), most + 1, true=most)
+        self.shapes = gates.shapes
         pairs = [(plan.definition, c) for plan, clauses in zip(plans, by_plan, strict=True) for c in clauses]
-        return self.code(pairs).pick(number)._replace(parts=parts, mask=mask)
+        return self.code(pairs).pick(number)._replace(inputs=gates.inputs, flipped=gates.negated)
 
 
 def _different(argument: str, names: Sequence[str]) -> tuple[str, ...]:

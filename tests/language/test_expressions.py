@@ -98,7 +98,7 @@ def test_copies_are_equal(tree) -> None:
     for copy in (deepcopy(expression), pickle.loads(pickle.dumps(expression))):
         assert copy == expression
         assert hash(copy) == hash(expression)
-        assert copy._node is expression._node
+        assert copy.node is expression.node
 
 
 def test_text() -> None:

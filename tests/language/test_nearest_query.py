@@ -2,21 +2,24 @@
 
 import statistics
 import time
+from dataclasses import replace
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lw_torchrl.language import nearest
-from lw_torchrl.language.nearest import nearest_query
-from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
+from lw_torchrl.language.expressions import leaves
+from lw_torchrl.language.nearest import _JOINS, nearest_query
+from lw_torchrl.language.queries import QueryError, parse_query, split_words, supported_queries
 from lw_torchrl.language.tasks import MT50
 
 tasks = st.sampled_from(MT50)
 WORDS = sorted({
     word for task in ("drawer-open", "stick-pull", "door-lock") for text in supported_queries(task)
     for word in text.split()
-} | {"a", "and", "but", "isn't", "doesn't", "never", "hand", "?", ",", "does", "over", "puck", "’", "AND"})  # fmt: skip
+} | {"a", "and", "but", "isn't", "doesn't", "never", "hand", "?", ",", "does", "over", "puck", "’", "AND",
+     "or", "nor", "unless", "either", "neither", "both", "(", ")", "always"})  # fmt: skip
 any_text = st.text(st.characters()) | st.lists(st.sampled_from(WORDS), max_size=25).map(" ".join)
 
 
@@ -37,7 +40,9 @@ def test_any_text_has_a_nearest_query(text, task):
     assert parse_query(str(match.query), task) == match.query
     assert match.parts
     clauses = [clause for part in match.parts for clause in part.query.clauses]
-    assert tuple(clauses) == match.query.clauses
+    if _JOINS.isdisjoint(split_words(text.casefold())):
+        assert tuple(clauses) == match.query.clauses
+    assert {replace(clause, negated=False) for clause in clauses}.issuperset(leaves(match.query.expression))
     assert all(0.0 <= part.score <= 1.0 for part in match.parts)
     assert match.score == pytest.approx(statistics.mean(part.score for part in match.parts))
     try:
@@ -155,3 +160,27 @@ def test_a_very_long_text_is_matched_in_time(text):
     started = time.perf_counter()
     nearest_query(text, "stick-pull")
     assert time.perf_counter() - started < 5.0
+
+
+@pytest.mark.parametrize(
+    ("text", "nearest_text"),
+    [
+        ("gripper is opened or not over the puck", "gripper open or not above the puck"),
+        ("not (gripper opened and over the puck)", "gripper not open or not above the puck"),
+        ("the gripper is neither opened nor over the puck", "gripper not open and not above the puck"),
+        ("gripper opened, unless it is over the puck", "gripper open and not above the puck"),
+        ("either (gripper opened or over the puck", "gripper open or above the puck"),
+    ],
+)
+def test_connectives(text, nearest_text):
+    assert nearest_query(text, "push").query == parse_query(nearest_text, "push")
+
+
+def test_two_relations_to_one_object():
+    match = nearest_query("the gripper is above or around teh puck", "push")
+    assert match.query == parse_query("gripper above puck or around puck", "push")
+
+
+def test_a_list_of_prepositions_is_one_condition():
+    match = nearest_query("the gripper is at or near the puck", "push")
+    assert str(match.query) == "the robot's gripper is near the puck"

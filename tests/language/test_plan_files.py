@@ -393,7 +393,7 @@ def test_any_condition_of_a_pair_becomes_the_nearest_query(tmp_path_factory, con
         ('{"push": [[' + "9" * 5000 + ", 3]]}", "expected JSON"),
         ('{"push": [["gripper is open", "wait"]], "push": [["gripper is closed", "wait"]]}', "'push' more than once"),
         (" " * 2**18 + "{}", f"at most {PLAN_LIMIT} bytes"),
-        ({"push": [["open and " * 64 + "closed", "wait"]]}, "push, step 1: .*64 clauses"),
+        ({"push": [["open and " * 256 + "closed", "wait"]]}, "push, step 1: .*256 clauses"),
     ],
 )
 def test_a_faulty_json_file_is_refused(write, value, message):

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from plan_texts import conditional_plans, queries
 
 import lw_torchrl as lw
+from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plan_files import parse_plan
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import parse_query
@@ -149,3 +150,16 @@ def test_a_description_of_several_lines_stays_in_one(tmp_path):
     plan = ConditionalPlan.from_pairs(task, [("gripper open", "stack the brick")])
     for format in NINE:
         assert read_back(plan, format) == plan
+
+
+@pytest.mark.parametrize("format", sorted(PLAN_FORMATS))
+def test_conditions_with_or_are_read_again(format):
+    pairs = [
+        ("gripper open or not above the puck", "move the gripper to the puck"),
+        ("not (gripper near puck and closed) unless the puck is near the target location", "grasp the puck"),
+        ("(gripper open or near puck) and (gripper closed or puck near target location)", "lift the puck"),
+        ("always", "place the gripper above the puck"),
+        ("never", "lift the puck"),
+    ]
+    plan = lw.ConditionalPlan.from_pairs("push", pairs)
+    assert lw.decode_plan(lw.encode_plan(plan, format), "push", format=format).plan == plan

@@ -6,19 +6,22 @@ import pickle
 import random
 import shutil
 import sys
+import time
 
 import pytest
 import torch
+from conditions import interpret, query_of, trees
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from states import all_tasks, observation, random_states
 from tensordict import TensorDict
 
 from lw_torchrl.language import query_program
+from lw_torchrl.language.expressions import all_of, any_of, negate
 from lw_torchrl.language.objects import GRIPPER, NamedObject
-from lw_torchrl.language.queries import supported_queries
+from lw_torchrl.language.queries import Query, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram, find_kernel
-from lw_torchrl.language.query_tables import MOST_FACTS
+from lw_torchrl.language.query_tables import MOST_FACTS, compile_queries
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
 
 
@@ -202,6 +205,80 @@ def test_the_kernel_gives_the_bits_of_the_tables_in_all_tasks():
         compiled, by_tables = both(program, given_states, ids)
         assert torch.equal(compiled, by_tables)
         assert 0 < compiled.sum() < compiled.numel()
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_expressions_are_interpreted_in_all_ways(data):
+    """The kernel, the tables and both kinds of logits at their extremes agree with direct interpretation."""
+    queries, expected, states = {}, [], []
+    for task in data.draw(st.lists(st.sampled_from(MT50), min_size=1, max_size=3, unique=True)):
+        leaves = data.draw(st.lists(st.sampled_from(supported_queries(task)), min_size=1, max_size=6, unique=True))
+        conditions = data.draw(st.lists(trees(st.sampled_from(leaves), 20), min_size=1, max_size=4))
+        states.append(torch.from_numpy(random_states(task, seed=3, n=30)))
+        truth = QueryProgram({task: leaves})(states[-1], torch.full((30,), task_id(task)))
+        columns = dict(zip(leaves, truth.unbind(1), strict=True))
+        expected.append([interpret(tree, columns.__getitem__) for tree in conditions])
+        queries[task] = [query_of(tree, task) for tree in conditions]
+    program = QueryProgram(queries)
+    states, ids = torch.cat(states), torch.tensor([task_id(task) for task in queries]).repeat_interleave(30)
+    steps = program.num_queries
+    padding = [torch.zeros(30, dtype=torch.bool)] * steps
+    answers = torch.cat([torch.stack([*columns, *padding][:steps], 1) for columns in expected])
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(query_program, "find_kernel", lambda: None)
+        assert torch.equal(program(states, ids), answers)
+    assert torch.equal(program(states, ids), answers)
+    for truth in ("min-max", "product"):
+        logits = program.logits(states, ids, temperature=1e-6, truth=truth)
+        assert torch.equal(logits > 0, answers) or truth == "product"
+        clear = logits.abs() > 1.0  # a leaf may be exactly on its threshold
+        assert torch.equal((logits > 0)[clear], answers[clear])
+
+
+def alternations(levels, clauses):
+    """Return an expression with 64 alternatives at each level, whose text has exponential length."""
+    tip = clauses[0]
+    for _ in range(levels):
+        tip = negate(all_of([any_of([tip, clause]) for clause in clauses]))
+    return tip
+
+
+def test_shared_parts_are_one_gate():
+    clauses = [parse_query(text, "stick-pull").expression for text in supported_queries("stick-pull")[:128:2]]
+    started = time.process_time()
+    tip = alternations(30, clauses)
+    tables, shapes = compile_queries({TASKS["stick-pull"]: [Query(tip), Query(negate(tip))]})
+    assert sum(gates for *_, gates in shapes) <= 30 * 65 + 2
+    assert tables.inputs.shape[1] < 500_000
+    assert time.process_time() - started < 2.0
+
+
+def test_the_logits_of_a_disjunction_and_a_negation():
+    texts = ["gripper open", "gripper near puck", "gripper open or near puck", "not (gripper open or near puck)"]
+    program, ids = QueryProgram({"push": texts}), torch.full((50,), task_id("push"))
+    states = torch.from_numpy(random_states("push", n=50)).requires_grad_()
+    opened, near, either, neither = program.logits(states, ids).unbind(1)
+    assert torch.equal(either, torch.maximum(opened, near))
+    assert torch.equal(neither, -either)
+    opened, near, either, neither = program.logits(states, ids, truth="product", temperature=10.0).double().unbind(1)
+    expected = 1 - (1 - opened.sigmoid()) * (1 - near.sigmoid())
+    torch.testing.assert_close(either.sigmoid(), expected)
+    torch.testing.assert_close(neither.sigmoid(), 1 - expected)
+    (gradient,) = torch.autograd.grad(either.sum(), states)
+    assert gradient.isfinite().all()
+    assert (gradient[:, [0, 3]] != 0).any(0).all(), "both operands have a gradient"
+    with pytest.raises(ValueError, match="min-max"):
+        program.logits(states, ids, truth="sum")
+
+
+def test_constant_conditions():
+    program, ids = QueryProgram({"push": ["always", "never"], "reach": ["always"]}), torch.tensor([task_id("push"), 36])
+    states = torch.zeros(2, 39)
+    ids[1] = task_id("reach")
+    for answer in both(program, states, ids):
+        assert answer.tolist() == [[True, False], [True, False]]
+    assert program.logits(states, ids).tolist() == [[1e4, -1e4]] * 2
 
 
 @pytest.mark.parametrize("compiled", [True, False])

@@ -12,10 +12,10 @@ from torch.func import vmap
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
+from lw_torchrl.language.gates import product
 from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.modules import transform_of, with_plans
-from lw_torchrl.modules.query_evaluator import conjunction
 
 PLANS = lw.load_plans("MT10")
 OTHER = lw.Plans([PLANS["push"]])
@@ -178,19 +178,41 @@ def test_not_changes_the_sign_of_a_logit():
     assert (logits[:, 0] != 0).all()
 
 
+def test_or_and_else_combine_the_answers_to_clauses():
+    texts = ["gripper open", "gripper near puck", "gripper open or near puck", "not (gripper open or near puck)"]
+    texts += ["gripper open and (near puck or above puck)", "gripper above puck", "always", "gripper not near puck"]
+    plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", [(text, "grasp the puck") for text in texts])])
+    evaluator = make(plans)
+    logits = evaluator(states(20, plans))["qaf_logits"]
+    opened, near, either, neither, nested, above, always, not_near = logits.double().sigmoid().unbind(1)
+    torch.testing.assert_close(either, 1 - (1 - opened) * (1 - near), atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(neither, (1 - opened) * (1 - near), atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(nested, opened * (1 - (1 - near) * (1 - above)), atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(not_near, 1 - near, atol=1e-6, rtol=1e-5)
+    assert (always > 0.999999).all()
+    slopes = torch.autograd.grad(logits[:, 3].sum(), evaluator.parameters(), retain_graph=True)
+    assert all(slope.isfinite().all() for slope in slopes)
+    assert any(slope.any() for slope in slopes)
+
+
+def test_plans_without_any_clause_are_refused():
+    plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", [("always", "grasp the puck")])])
+    with pytest.raises(ValueError, match="condition with a clause"):
+        make(plans)
+
+
 def test_probability_of_a_conjunction_is_the_product():
-    logits = torch.tensor([[0.3, -1.2, 2.0], [29.0, 30.0, -30.0], [4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    mask = torch.tensor([[True, True, True], [True, True, False], [True, False, False], [False, False, False]])
-    output = conjunction(logits, mask)
-    p = torch.where(mask, logits.double().sigmoid(), 1.0).prod(-1)
+    logits = torch.tensor([[0.3, -1.2, 2.0], [29.0, 30.0, 1e4], [4.0, 1e4, 1e4], [1e4, 1e4, 1e4]])
+    output = product(logits)
+    p = logits.double().sigmoid().prod(-1)
     assert torch.allclose(output[:3].double(), p[:3].logit(), atol=1e-4)
     assert output[3] > 29
-    assert torch.allclose(conjunction(logits[:, :1], mask[:, :1])[:3], logits[:3, 0], atol=1e-5)
+    assert torch.allclose(product(logits[:, :1])[:3], logits[:3, 0], atol=1e-5)
 
 
 def test_conjunction_has_a_finite_gradient_everywhere():
-    logits = torch.tensor([[30.0, 30.0], [-30.0, -30.0], [0.0, 1.0]], requires_grad=True)
-    conjunction(logits, torch.tensor([[True, True], [True, True], [False, False]])).sum().backward()
+    logits = torch.tensor([[30.0, 30.0], [-30.0, -30.0], [1e4, 1e4]], requires_grad=True)
+    product(logits).sum().backward()
     assert logits.grad.isfinite().all()
     assert (logits.grad[2] == 0).all()
 

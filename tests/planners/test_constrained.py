@@ -238,3 +238,16 @@ def test_a_server_that_ignores_the_schema(ask, tmp_path):
     (answer,) = ask(FakeServer(lambda body: completion(text)), "push", format="basic_py", constrain=True)
     assert answer.decoded.plan is not None
     assert answer.notes == ("the answer does not follow the schema",)
+
+
+def test_a_condition_with_or_is_a_sentence():
+    pairs = [("gripper open or near puck", "grasp the puck"), ("not (gripper open or near puck)", "lift the puck")]
+    plan = lw.ConditionalPlan.from_pairs("push", pairs)
+    text = write_structured(plan, PLAN_FORMATS["basic_py"].style)
+    assert '"condition": "the robot' in text
+    clauses = read_structured(text).sections[0].clauses
+    assert [lw.parse_query(clause.condition, "push") for clause in clauses] == [step.condition for step in plan.steps]
+    both = '{"steps": [{"condition": ["gripper open or closed", "gripper near puck"], "skill": "grasp the puck"}]}'
+    (clause,) = read_structured(both).sections[0].clauses
+    expected = lw.parse_query("(gripper open or closed) and gripper near puck", "push")
+    assert lw.parse_query(clause.condition, "push") == expected

@@ -11,7 +11,7 @@ from PIL import Image
 from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, record
 
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.queries import Clause, Query
+from lw_torchrl.language.queries import Clause, Query, parse_query
 from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.page import EVENLY, NONE_HOLDS
@@ -220,6 +220,21 @@ def test_errors_name_the_wrong_column(tmp_path, change, message):
 def test_conditions_are_shortened(clauses, text):
     assert short_condition(Query(tuple(clauses))) == text
     assert short_condition("free-form text") == "free-form text"
+
+
+@pytest.mark.parametrize(
+    ("text", "short"),
+    [
+        ("gripper not open or near puck", "gripper not open or gripper near puck"),
+        (
+            "gripper near puck and (open or puck touching the table)",
+            "gripper near puck and (gripper open or puck on table)",
+        ),
+        ("always", "always"),
+    ],
+)
+def test_other_conditions_are_shortened_clause_by_clause(text, short):
+    assert short_condition(parse_query(text, "push")) == short
 
 
 def test_names_of_objects_at_one_position_do_not_overlap():

@@ -1,0 +1,51 @@
+"""Random conditions as trees, their English, and their truth by direct interpretation."""
+
+from __future__ import annotations
+
+from hypothesis import strategies as st
+
+from lw_torchrl.language.expressions import all_of, any_of, negate
+from lw_torchrl.language.queries import Query, parse_query
+
+
+def trees(leaves, most=12):
+    """Return a strategy of trees ("all" | "any", parts), ("not", part) or leaf, with at most ``most`` leaves."""
+    joined = lambda inner: st.tuples(st.sampled_from(["all", "any"]), st.lists(inner, min_size=1, max_size=4))  # noqa: E731
+    return st.recursive(leaves, lambda inner: joined(inner) | st.tuples(st.just("not"), inner), max_leaves=most)
+
+
+def interpret(tree, truth):
+    """Return the truth of a tree, given a function from leaves to their truth; works with bool and with tensors."""
+    if isinstance(tree, str):
+        return truth(tree)
+    operator, parts = tree
+    if operator == "not":
+        return ~interpret(parts, truth)
+    result, *others = [interpret(part, truth) for part in parts]
+    for other in others:
+        result = result & other if operator == "all" else result | other
+    return result
+
+
+def query_of(tree, task):
+    """Build the query of a tree whose leaves are texts of clauses."""
+
+    def build(tree):
+        if isinstance(tree, str):
+            return parse_query(tree, task).expression
+        operator, parts = tree
+        if operator == "not":
+            return negate(build(parts))
+        return (all_of if operator == "all" else any_of)([build(part) for part in parts])
+
+    return Query(build(tree))
+
+
+def text_of(tree):
+    """Write a tree with a parenthesis around each part."""
+    if isinstance(tree, str):
+        return tree
+    operator, parts = tree
+    if operator == "not":
+        return f"not ({text_of(parts)})"
+    return (" and " if operator == "all" else " or ").join(f"({text_of(part)})" for part in parts)
