@@ -236,9 +236,15 @@ class StepMapper:
     def __init__(self, task: Task, skills: Skills | None) -> None:
         self.task, self.skills = task, skills_for(task, skills)
         self.compared = 0
+        self.mapped: dict[str, MappedQuery] = {}
 
     def query(self, text: str) -> MappedQuery:
         """Map a text to the nearest query within the limit."""
+        if text not in self.mapped:
+            self.mapped[text] = self._query(text)
+        return self.mapped[text]
+
+    def _query(self, text: str) -> MappedQuery:
         if (query := read_query(text, self.task)) is not None:
             return MappedQuery(query, 0.0, exact=True)
         self.compared += 1

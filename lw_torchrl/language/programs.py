@@ -183,6 +183,31 @@ def is_condition(node: Node) -> bool:
     return isinstance(node, Check)
 
 
+def tidy(guard: Expression) -> Expression:
+    """Drop the alternatives that the rest of a conjunction excludes: "a and (not a or b)" becomes "a and b".
+
+    Example:
+        >>> print(tidy(all_of(["a", any_of([negate("a"), "b"])])))
+        a and b
+    """
+    while guard.kind == "all":
+        excluded = {negate(part) for part in guard.parts if part.kind == "leaf"}
+
+        def shorter(part: Expression, excluded: set[Expression] = excluded) -> Expression:
+            if part.kind != "any":
+                return part
+            return any_of(
+                each
+                for each in part.parts
+                if excluded.isdisjoint((each, *each.parts) if each.kind == "all" else (each,))
+            )
+
+        before, guard = guard, all_of(map(shorter, guard.parts))
+        if guard == before:
+            break
+    return guard
+
+
 class _Compiler:
     def __init__(self, effect: Callable[[str], str | None], known: Callable[[str], bool]) -> None:
         self.effect, self.known, self.steps = effect, known, list[Guarded]()

@@ -33,7 +33,7 @@ from lw_torchrl.language.tasks import Task, get_task
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
 _OTHERS = frozenset(("(", *CONNECTIVES)) - {"and"}
-_MOST_CLAUSES = 256  # in the text of a query
+MOST_CLAUSES = 256  # in the text of a query
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ def split_words(text: str) -> list[str]:
     """
     words = re.findall(r"[()]|[^\s()]+", text)
     clauses = 1 + sum(word.casefold() in ("and", "or", "nor", "unless") for word in words)
-    if clauses > _MOST_CLAUSES:
-        raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {clauses}")
+    if clauses > MOST_CLAUSES:
+        raise QueryError(f"query {_cut(text)!r} must have at most {MOST_CLAUSES} clauses, got {clauses}")
     spaced, pattern = " ".join(words), _two_relations(tuple(RELATIONS))
     if pattern.search(spaced) is None:
         return words
@@ -320,8 +320,8 @@ def check_query(query: str | Query, task: str | Task) -> Query:
     if not isinstance(query, Query):
         return parse_query(query, task)
     owner = get_task(task)
-    if (clauses := max(len(query.clauses), count_mentions(query.expression))) > _MOST_CLAUSES:
-        raise QueryError(f"a query must have at most {_MOST_CLAUSES} clauses when it is written, got {clauses}")
+    if (clauses := max(len(query.clauses), count_mentions(query.expression))) > MOST_CLAUSES:
+        raise QueryError(f"a query must have at most {MOST_CLAUSES} clauses when it is written, got {clauses}")
     if all(_is_of(clause, owner) for clause in query.clauses):
         return query
     return parse_query(str(query), owner)  # resolves aliases, or raises an error that explains the fault

@@ -94,6 +94,7 @@ _CHECK = re.compile(rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check
 _CALL = re.compile(r"(?:self\.)?robot\.(\w+)\s*\(\s*")
 # A comment that may begin the section of a task: "# drawer-open: ...".
 _HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
+_CONTROL = re.compile(r"(?:return|break|continue)\b|[a-z_]\w*\s*=(?!=)|(?:elif|else)\b")
 _MOST_JOINED = 6  # maximum number of lines of a statement
 
 
@@ -116,6 +117,7 @@ class PythonReading(Reading):
         self.reason: list[str] = []
         self.listing = False
         self.is_outside = False  # whether the last line was not part of a plan
+        self.has_control = False  # whether the text has control flow that only CodeReading understands
         for number, line in _statements(text):
             if not self.read(number, line):
                 break
@@ -180,6 +182,7 @@ class PythonReading(Reading):
         else:
             if not self.is_outside:  # one note for consecutive lines
                 self.note(number, f"the text is not part of a plan: {shown(code)}")
+            self.has_control |= _CONTROL.match(code) is not None and (bool(self.blocks) or "=" in code)
             self.is_outside = True
             return
         self.is_outside = False
@@ -189,8 +192,10 @@ class PythonReading(Reading):
         condition, rest = (None, code[branch.end() :]) if branch[2] else self.condition(number, code, branch.end())
         if branch[2]:
             self.note(number, "'else' has no condition; the skills under it are left out")
+            self.has_control = True
         if branch[1] == "elif":
             self.note(number, "'elif' is read as 'if', without the negation of the conditions above")
+            self.has_control = True
         if self.blocks and self.blocks[-1].body is None:
             self.blocks[-1].body = indent
         self.blocks.append(_Block(indent, number, condition))
@@ -218,6 +223,7 @@ class PythonReading(Reading):
             fault = fault or (f'expected only check("..."), got {shown(code)}' if rest else "")
         if fault:
             self.note(number, fault)
+            self.has_control = True
         return (None if fault else " and ".join(conditions)), rest.lstrip(": ")
 
     def call(self, number: int, indent: int, code: str, call: re.Match[str]) -> None:
@@ -235,10 +241,12 @@ class PythonReading(Reading):
             return
         if not self.blocks:
             self.note(number, f"a skill without a condition is left out: {shown(code)}")
+            self.has_control = True
             return
         block = self.blocks[-1]
         if self.section.clauses and self.section.clauses[-1].line == block.line:
             self.note(number, "a second skill under the same condition becomes a separate step")
+            self.has_control = True
         block.body = indent if block.body is None else block.body
         conditions = [above.condition for above in self.blocks if above.condition is not None]
         if len(conditions) < len(self.blocks):
