@@ -19,7 +19,7 @@ from lw_torchrl.language.formats.sentences import SentenceReading
 from lw_torchrl.language.formats.trees import TreeReading
 from lw_torchrl.language.nearest import LIMIT, MappedQuery, StepMapper
 from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line
-from lw_torchrl.language.programs import Done, ProgramError, compile_program, tidy
+from lw_torchrl.language.programs import Done, ProgramError, compile_program, has_conditions, tidy
 from lw_torchrl.language.queries import MOST_CLAUSES, Query
 from lw_torchrl.language.skills import Skills, canonical_skill
 from lw_torchrl.language.step_parser import skill_effect
@@ -79,8 +79,8 @@ def decode_plan(
     accepted.
 
     Programs are plans, too: Python with ``elif``, ``else``, ``or``, ``while``, early ``return`` and helper functions,
-    behaviour trees, rules and state machines in JSON or YAML, and prose with "otherwise" and "repeat until". Each action
-    becomes a step whose condition is that of its path; what cannot be expressed is left out with a note.
+    behaviour trees, rules and state machines in JSON or YAML, and prose with "otherwise" and "repeat until". Each
+    action becomes a step whose condition is that of its path. What cannot be expressed is left out, with a note.
 
     Each clause of a condition outside the query language is replaced by the nearest query by edit distance; without a
     near query the step is dropped. ``plan`` keeps the skills as written; ``scripted`` has the nearest scripted skills.
@@ -158,9 +158,11 @@ def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) 
     empty = list[tuple[Reading, Section]]()
     for number, group in enumerate(groups):
         best = first = _with_clauses(group[0](text), mapper)
-        if len(group) > 1 and _has_control(*first, text):
-            other_text = _own_lines(text, first[0], mapper.task) if group[1] is SentenceReading else text
-            other = _with_clauses(group[1](other_text), mapper)
+        own = _own_lines(text, first[0], mapper.task) if ProseReading in group else text
+        if len(group) > 1 and _has_control(*first, own):
+            other = _with_clauses(group[1](own), mapper)
+            if read is not None and group[1] is SentenceReading and not has_conditions(other[1].tree):
+                other = first  # a list of steps without conditions is not a plan in a published format
             best = max(first, other, key=lambda pair: (_kept(pair[1]), -len(_section_notes(*pair, mapper.task))))
         if best[1].clauses:
             if number and read is not None:
@@ -205,9 +207,7 @@ def _has_control(reading: Reading, section: Section, text: str) -> bool:
     """Return whether a text may have control flow that the reader of a published format does not understand."""
     if isinstance(reading, PythonReading):
         return reading.has_control or not section.clauses
-    return not section.clauses or any(
-        _CONTROL_WORDS.search(f"{clause.condition} {clause.skill} {clause.reason}") for clause in section.clauses
-    )
+    return not section.clauses or _CONTROL_WORDS.search(text) is not None
 
 
 def _own_lines(text: str, reading: Reading, task: Task) -> str:

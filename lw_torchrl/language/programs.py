@@ -161,19 +161,29 @@ def choose(condition: Expression, then: Expression, otherwise: Expression) -> Ex
     return any_of([all_of([condition, then]), all_of([negate(condition), otherwise])])
 
 
-def actions_of(node: Node | None) -> Iterator[Action]:
-    """Yield the actions of a program, in the order of the text."""
-    stack = [node]
+def nodes_of(program: Node | None) -> Iterator[Node]:
+    """Yield the parts of a program, in the order of the text."""
+    stack = [program]
     while stack:
         each = stack.pop()
-        if isinstance(each, Action):
+        if each is not None:
             yield each
-        elif isinstance(each, Branch):
+        if isinstance(each, Branch):
             stack += [each.otherwise, each.then]
         elif isinstance(each, Loop):
             stack.append(each.body)
         elif isinstance(each, Sequence | Block | Selector):
             stack += reversed(each.parts)
+
+
+def actions_of(program: Node | None) -> Iterator[Action]:
+    """Yield the actions of a program, in the order of the text."""
+    return (node for node in nodes_of(program) if isinstance(node, Action))
+
+
+def has_conditions(program: Node | None) -> bool:
+    """Return whether a program has any condition."""
+    return any(isinstance(node, Branch | Loop | Check) for node in nodes_of(program))
 
 
 def is_condition(node: Node) -> bool:
@@ -190,21 +200,16 @@ def tidy(guard: Expression) -> Expression:
         >>> print(tidy(all_of(["a", any_of([negate("a"), "b"])])))
         a and b
     """
-    while guard.kind == "all":
+    before = None
+    while guard.kind == "all" and guard != before:
         excluded = {negate(part) for part in guard.parts if part.kind == "leaf"}
-
-        def shorter(part: Expression, excluded: set[Expression] = excluded) -> Expression:
-            if part.kind != "any":
-                return part
-            return any_of(
-                each
-                for each in part.parts
-                if excluded.isdisjoint((each, *each.parts) if each.kind == "all" else (each,))
-            )
-
-        before, guard = guard, all_of(map(shorter, guard.parts))
-        if guard == before:
-            break
+        parts = [
+            any_of(each for each in part.parts if excluded.isdisjoint(each.parts if each.kind == "all" else (each,)))
+            if part.kind == "any"
+            else part
+            for part in guard.parts
+        ]
+        before, guard = guard, all_of(parts)
     return guard
 
 
@@ -298,7 +303,8 @@ class _Compiler:
             is_action, beside = isinstance(part, Action), isinstance(node, Block) and isinstance(part, Branch)
             guard = all_of([here, hard, soft] if is_action or not isinstance(node, Block) else [here, hard])
             later = [parts[other] for other in waits if other > number]
-            stops = followed or any(not beside or isinstance(other, Action) for other in later)
+            ends = any(isinstance(other, Jump) and not other.label for other in parts[number:])
+            stops = (followed and not ends) or any(not beside or isinstance(other, Action) for other in later)
             flow = self.run(part, guard, stops, depth)
             fails.append(all_of([done, flow.fails]))
             for label, condition in flow.jumps.items():

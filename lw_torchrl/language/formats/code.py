@@ -280,9 +280,8 @@ class _Scope:
 
     def is_action(self, node: ast.Call) -> bool:
         """Return whether a call is a skill: a method of the robot, or a function whose first word is a verb."""
-        root = ast.unparse(node.func).removeprefix("self.").partition(".")
-        robot = root[1] != "" and root[0] in ("robot", "arm", "gripper", "hand")
-        return robot or is_verb(words_of(_name(node.func))[:1])
+        root, dot, _ = ast.unparse(node.func).removeprefix("self.").partition(".")
+        return root in PYTHON["robots"] if dot else is_verb(words_of(_name(node.func))[:1])
 
     def receiver(self, node: ast.expr) -> str:
         """Return the words before a method's name, without the robot: "gripper" in ``robot.gripper.close()``."""
