@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from lw_torchrl._util.checks import check_choice, counted, shown, typed
-from lw_torchrl.language.expressions import FALSE, Expression, count_mentions, replace_leaves
+from lw_torchrl.language.expressions import FALSE, TRUE, Expression, count_mentions, leaves, replace_leaves
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, listed_steps
 from lw_torchrl.language.formats.code import CodeReading
@@ -19,7 +19,7 @@ from lw_torchrl.language.formats.sentences import SentenceReading
 from lw_torchrl.language.formats.trees import TreeReading
 from lw_torchrl.language.nearest import LIMIT, MappedQuery, StepMapper
 from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line
-from lw_torchrl.language.programs import Done, ProgramError, compile_program, has_conditions, tidy
+from lw_torchrl.language.programs import Done, Node, ProgramError, compile_program, tidy
 from lw_torchrl.language.queries import MOST_CLAUSES, Query
 from lw_torchrl.language.skills import Skills, canonical_skill
 from lw_torchrl.language.step_parser import skill_effect
@@ -120,7 +120,7 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
         for clause, words in zip(section.clauses, listed, strict=True)
     ]
     steps = [_mapped(clause, mapper, notes) for clause in clauses]
-    notes = [*dict.fromkeys(notes), *_section_notes(reading, section, owner)]
+    notes += _section_notes(reading, section, owner)
 
     def plan(skills: Sequence[str | None]) -> ConditionalPlan | None:
         kept = tuple(
@@ -133,6 +133,17 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
     written, scripted = plan([step.written_skill for step in steps]), plan([step.scripted for step in steps])
     reason = "" if written is not None else _why_none(reading, steps, owner, text)
     return DecodedPlan(written, scripted, reason, tuple(sorted(notes, key=lambda note: note.line)), tuple(steps))
+
+
+def decode_program(program: str | Node, task: Task) -> DecodedPlan:
+    """Decode a program in any format, or a tree of :mod:`lw_torchrl.language.programs`, like :func:`decode_plan`."""
+    if isinstance(program, str):
+        return decode_as(program, None, StepMapper(task, None))
+
+    def read(text: str) -> Reading:
+        return Reading([Section("", 1, tree=program)])
+
+    return decode_as(" ", read, StepMapper(task, None))
 
 
 def _same(name: str, task: Task) -> bool:
@@ -157,23 +168,24 @@ def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) 
         groups = groups if read in groups[0] else [(read,), *groups]
     empty = list[tuple[Reading, Section]]()
     for number, group in enumerate(groups):
-        best = first = _with_clauses(group[0](text), mapper)
+        best = first = _with_clauses(group[0], text, mapper)
+        empty.append(first)
         own = _own_lines(text, first[0], mapper.task) if ProseReading in group else text
         if len(group) > 1 and _has_control(*first, own):
-            other = _with_clauses(group[1](own), mapper)
-            if read is not None and group[1] is SentenceReading and not has_conditions(other[1].tree):
-                other = first  # a list of steps without conditions is not a plan in a published format
+            other = _with_clauses(group[1], own, mapper)
+            if group[1] is SentenceReading and all(clause.condition in (TRUE, FALSE) for clause in other[1].clauses):
+                other = first  # prose without any condition is not a plan
+            empty.append(other)
             best = max(first, other, key=lambda pair: (_kept(pair[1]), -len(_section_notes(*pair, mapper.task))))
         if best[1].clauses:
             if number and read is not None:
                 best[0].note(best[1].clauses[0].line, "the plan is not in the requested format")
             return best
-        empty.append(best)
-    return empty[0] if read is not None else max(empty, key=lambda pair: len(pair[0].sections))
+    return next((pair for pair in empty if pair[0].error), empty[0])
 
 
-def _with_clauses(reading: Reading, mapper: StepMapper) -> tuple[Reading, Section]:
-    """Compile the programs for the task, and return the reading with its section of the most clauses."""
+def _with_clauses(read: Callable[[str], Reading], text: str, mapper: StepMapper) -> tuple[Reading, Section]:
+    """Read a text, compile the programs for the task, and return the reading and its section of the most clauses."""
 
     def effect(skill: str) -> str | None:
         goal = mapper.query(skill.partition(" until ")[2]) if " until " in skill else None
@@ -184,13 +196,17 @@ def _with_clauses(reading: Reading, mapper: StepMapper) -> tuple[Reading, Sectio
             return None if query is None else str(query)
         return None
 
+    try:
+        reading = read(text)
+    except (RecursionError, ProgramError) as error:
+        reading = Reading(error=str(error) if isinstance(error, ProgramError) else "the text nests too deeply")
     own = [section for section in reading.sections if not section.task or _same(section.task, mapper.task)]
     for section in own:
         if section.tree is not None:
             try:
                 steps = compile_program(section.tree, effect, lambda text: mapper.query(text).query is not None)
             except ProgramError as error:
-                reading.note(section.line, str(error))
+                reading.error = str(error)
                 continue
             section.clauses = [
                 Clause(step.action.line, step.guard, one_line(step.action.text), step.action.goal) for step in steps
@@ -292,19 +308,18 @@ def _mapped_guard(clause: Clause, mapper: StepMapper, notes: list[Note]) -> tupl
         if isinstance(leaf, Done):
             effect = skill_effect(leaf.text, mapper.task)
             return FALSE if effect is None else effect.expression
+        is_new = leaf not in mapper.mapped
         mapped, distance, exact = mapper.query(leaf)
         distances.append(distance)
         if mapped is None:
             unknown.append(leaf)
-            notes.append(
-                Note(clause.line, f"the condition {shown(leaf)} counts as never true: no query is near enough")
-            )
-            return FALSE
-        if not exact:
-            read = f"is read as {str(mapped)!r} (distance {distance:.2f})"
-            notes.append(Note(clause.line, f"the condition {shown(leaf)} {read}"))
-        return mapped.expression
+        if is_new and not exact:
+            how = "counts as never true" if mapped is None else f"is read as {str(mapped)!r}"
+            notes.append(Note(clause.line, f"the condition {shown(leaf)} {how} (distance {distance:.2f})"))
+        return FALSE if mapped is None else mapped.expression
 
+    if len(leaves(guard)) > MOST_CLAUSES:
+        return None, 0.0, []
     try:
         mapped = tidy(replace_leaves(tidy(guard), query))
     except ValueError:
@@ -331,6 +346,8 @@ def _why_none(reading: Reading, steps: list[DecodedStep], task: Task, text: str)
     """Return the reason why a text has no plan."""
     if steps:
         return f"all steps for {task.name} were dropped ({len(steps)}), the first because {steps[0].dropped}"
+    if reading.error:
+        return reading.error
     if not text.strip():
         return "the text is empty"
     if others := sorted({other.task for other in reading.sections if other.clauses}):

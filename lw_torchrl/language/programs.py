@@ -161,29 +161,19 @@ def choose(condition: Expression, then: Expression, otherwise: Expression) -> Ex
     return any_of([all_of([condition, then]), all_of([negate(condition), otherwise])])
 
 
-def nodes_of(program: Node | None) -> Iterator[Node]:
-    """Yield the parts of a program, in the order of the text."""
+def actions_of(program: Node | None) -> Iterator[Action]:
+    """Yield the actions of a program, in the order of the text."""
     stack = [program]
     while stack:
         each = stack.pop()
-        if each is not None:
+        if isinstance(each, Action):
             yield each
-        if isinstance(each, Branch):
+        elif isinstance(each, Branch):
             stack += [each.otherwise, each.then]
         elif isinstance(each, Loop):
             stack.append(each.body)
         elif isinstance(each, Sequence | Block | Selector):
             stack += reversed(each.parts)
-
-
-def actions_of(program: Node | None) -> Iterator[Action]:
-    """Yield the actions of a program, in the order of the text."""
-    return (node for node in nodes_of(program) if isinstance(node, Action))
-
-
-def has_conditions(program: Node | None) -> bool:
-    """Return whether a program has any condition."""
-    return any(isinstance(node, Branch | Loop | Check) for node in nodes_of(program))
 
 
 def is_condition(node: Node) -> bool:

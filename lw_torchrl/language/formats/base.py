@@ -89,6 +89,7 @@ class Reading:
 
     sections: list[Section] = field(default_factory=lambda: [Section("", 1)])
     notes: list[Note] = field(default_factory=list)
+    error: str = ""  # why the text cannot be read as a program
 
     @property
     def section(self) -> Section:

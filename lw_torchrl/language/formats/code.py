@@ -6,7 +6,7 @@ import ast
 import re
 import warnings
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from lw_torchrl._util.checks import shown
@@ -21,10 +21,23 @@ from lw_torchrl.language.formats.base import (
     words_of,
 )
 from lw_torchrl.language.formats.python import state_to_reach
-from lw_torchrl.language.programs import Action, Block, Branch, Jump, Label, Loop, Node, actions_of, choose
+from lw_torchrl.language.programs import (
+    Action,
+    Block,
+    Branch,
+    Jump,
+    Label,
+    Loop,
+    Node,
+    ProgramError,
+    actions_of,
+    choose,
+)
 
 PYTHON = PROGRAM_WORDS["python"]
 _MOST_REPAIRS = 8  # maximum number of syntax errors to cut off
+_MOST_TEXTS = 64  # maximum number of values of a text that depends on conditions
+_LONGEST = 1_000  # maximum length of a text (characters)
 _MOST_INLINED = 500  # maximum number of inlined calls and unrolled rounds, which bounds the time
 _START = re.compile(r"\s*(?:(?:async\s+)?def|class|if|while|for|import|from|@\w+|[\w.]+\s*[=(])(?!\w)")
 
@@ -36,6 +49,13 @@ class _Choice:
     condition: Expression
     then: _Text
     otherwise: _Text
+    count: int = field(init=False)  # of strings
+
+    def __post_init__(self) -> None:
+        count = sum(each.count if isinstance(each, _Choice) else 1 for each in (self.then, self.otherwise))
+        if count > _MOST_TEXTS:
+            raise ProgramError(f"a text must depend on few conditions; it has more than {_MOST_TEXTS} values")
+        object.__setattr__(self, "count", count)
 
 
 _Text: TypeAlias = str | _Choice
@@ -72,7 +92,7 @@ class CodeReading(Reading):
                 while lines and (not (last := lines[-1].partition("#")[0].rstrip()) or last.endswith(":")):
                     lines.pop()  # a block without a body
             except (ValueError, MemoryError, RecursionError):
-                self.note(start + 1, "the code nests too deeply to be parsed")
+                self.error = "the code nests too deeply"
                 return None
             else:
                 ast.increment_lineno(module, start - 1)
@@ -146,8 +166,12 @@ class _Scope:
                 return self.expression(value)
             case ast.Return(value=value):
                 return [*(self.expression(value, is_returned=True) if value is not None else []), Jump(self.end)]
-            case ast.If(test=test, body=body, orelse=orelse):
-                return [self.choice([(self.condition(test), body)], orelse)]
+            case ast.If(orelse=orelse):
+                chain = [node]
+                while len(orelse) == 1 and isinstance(orelse[0], ast.If):  # a loop, since a chain may be long
+                    chain.append(orelse[0])
+                    orelse = orelse[0].orelse
+                return [self.choice([(self.condition(each.test), each.body) for each in chain], orelse)]
             case ast.Match(subject=subject, cases=cases):
                 tests = [(self.case(subject, case), case.body) for case in cases]
                 return [self.choice(tests, [])]
@@ -470,7 +494,9 @@ def _joined(parts: Sequence[_Text], gap: str = " ") -> _Text:
         if isinstance(part, _Choice):
             both = (_joined([*parts[:number], each, *parts[number + 1 :]], gap) for each in (part.then, part.otherwise))
             return _Choice(part.condition, *both)
-    return " ".join(gap.join(str(part) for part in parts if part != "").split())
+    if sum(map(len, parts)) > _LONGEST:  # type: ignore[arg-type]
+        raise ProgramError(f"a text must have at most {_LONGEST} characters")
+    return gap.join(str(part) for part in parts if part != "")
 
 
 def _leaf(text: _Text) -> Expression:
@@ -483,7 +509,7 @@ def _leaf(text: _Text) -> Expression:
 def _action(text: _Text, line: int, goal: str = "") -> Node:
     if isinstance(text, _Choice):
         return Branch(text.condition, _action(text.then, line, goal), _action(text.otherwise, line, goal))
-    return Action(text, line, goal)
+    return Action(" ".join(text.split()), line, goal)
 
 
 def _chosen(condition: Expression, then: _Value, otherwise: _Value | None) -> _Value:

@@ -12,6 +12,8 @@ from lw_torchrl.language.formats.prose import NO_SKILL
 from lw_torchrl.language.programs import Action, Block, Branch, Jump, Label, Loop, Node, Sequence, actions_of
 
 _ITEM = re.compile(r"(\s*)(?:(?:step\s+)?[\[(]?(\d{1,3})[.):\]]+|[-*•–+]|\(?[a-z][.)])\s+(.*)", re.IGNORECASE)
+_LONGEST = 1_000  # characters of a sentence
+_NO_PROSE = re.compile(r"""\s*(?:[#`~{}<]|['"]{3}|(?:def|class|import|from|return) (?!to\b)|[\w.]+(?:\(| = ))""")
 _LEAD = re.compile(
     r"(?:then|next|first|finally|lastly|last|now|and|also|after that|in that case|please|just)\b,?\s+", re.I
 )
@@ -63,7 +65,7 @@ class SentenceReading(Reading):
         indents = [0]
         for number, line in enumerate(text.splitlines(), 1):
             self.line = number
-            before, *cut = END.split(line, maxsplit=1)
+            before, *cut = END.split("" if _NO_PROSE.match(line) else line, maxsplit=1)
             item, indent = _ITEM.match(before), len(before) - len(before.lstrip())
             while len(indents) > 1 and indent <= indents[-1]:
                 indents.pop()
@@ -73,7 +75,7 @@ class SentenceReading(Reading):
                 self.step = int(item[2])
                 if not _OTHERWISE.match(content):
                     self.root.append(Label(item[2]))
-            for sentence in re.split(r"(?<=[.;!?])\s+", content):
+            for sentence in re.split(r"(?<=[.;!?])\s+|\s{2,}(?=\d{1,2}[.)]\s)", content):
                 self.sentence(sentence.strip(" .;!"))
             if content.endswith(":") and len(self.scopes) > len(indents):
                 indents.append(indent)
@@ -85,7 +87,7 @@ class SentenceReading(Reading):
 
     def sentence(self, text: str) -> None:
         """Add a sentence to the current scope."""
-        if not text or text.startswith(("```", "#")):
+        if not text or len(text) > _LONGEST:
             return
         while lead := _LEAD.match(text):
             text = text[lead.end() :]

@@ -11,7 +11,7 @@ from typing import Any
 
 from lw_torchrl._util.checks import shown
 from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, as_expression, negate
-from lw_torchrl.language.formats.base import PROGRAM_WORDS, Reading, code_blocks, in_turn, words_of
+from lw_torchrl.language.formats.base import PROGRAM_WORDS, Reading, code_blocks, in_turn, is_verb, words_of
 from lw_torchrl.language.programs import (
     Block,
     Branch,
@@ -46,9 +46,10 @@ class TreeReading(Reading):
             try:
                 node = tree.node(value)
             except (RecursionError, ValueError):
-                self.note(start + 1, "the tree is too large or nests too deeply")
+                self.error = "the tree is too large or nests too deeply"
                 continue
-            if node is not None and next(actions_of(node), None) is not None:
+            texts = [action.text.split() for action in actions_of(node)]
+            if node is not None and texts and (isinstance(value, dict) or all(map(is_verb, texts))):
                 self.add_tree("", start + 1, node)
 
 
@@ -143,8 +144,9 @@ class _Tree:
             return self.until(self.action(row), row)
         for role in ("rules", "sequence"):
             if (rules := _get(row, role)) is not None:
+                parts = tuple(self.children(rules))
                 last = self.node(_get(row, "otherwise"))
-                parts = (*self.children(rules), *([] if last is None else [last]))
+                parts = parts if last is None else (*parts, last)
                 if role == "rules" or last is not None:
                     return Selector(parts)
                 return (Block if any(isinstance(part, Branch) for part in parts) else Sequence)(parts)
