@@ -6,9 +6,10 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
+from lw_torchrl.language.expressions import TRUE
 from lw_torchrl.language.objects import GOAL, GRIPPER, WORDS
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep
-from lw_torchrl.language.queries import Clause
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep, usual_goal
+from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.roles import Direction, Verb, mark_objects, simplify
 from lw_torchrl.language.tasks import Task, first_object, is_goal, object_of, same_object, whole_objects
 
@@ -91,6 +92,34 @@ def parse_steps(plan: ConditionalPlan) -> tuple[ParsedStep | None, ...]:
     if all(each is None or each.verb in _NO_MOTION for each in parsed):
         parsed = _parse(plan, _resolve_it([_last_clause(text) for text in marked], facts, task), facts)
     return parsed
+
+
+def skill_effect(skill: str, task: Task) -> Query | None:
+    """Return the state that a skill makes true, such as "the gripper is open"; None if no query expresses that state.
+
+    Example:
+        >>> from lw_torchrl import TASKS
+        >>> print(skill_effect("move above the puck", TASKS["push"]))
+        the robot's gripper is above the puck
+    """
+    if (goal := usual_goal(skill, task)) is not None:
+        return goal
+    step, text = PlanStep(Query(TRUE), skill), simplify(mark_objects(skill, task))
+    parsed = _StepParser(step, task, text, _Facts.of(step), grasping=True).parse()
+    if parsed is None or parsed.moved is None or parsed.confidence < 0.6:
+        return None
+    if parsed.verb in ("open", "close"):
+        return Query((Clause(GRIPPER, "open" if parsed.verb == "open" else "closed"),))
+    moved, target = parsed.moved, parsed.target
+    by_hand = {"approach": "above", "descend": "near", "reach": "near"}.get(parsed.verb)
+    brought = parsed.verb in ("carry", "move") and re.search(rf"\b(?:to|onto|into) <{re.escape(str(target))}>", text)
+    if target == GOAL:
+        target = next((name for name in task.object_names if is_goal(task, name)), None)
+    if parsed.direction or target == moved or not {moved, target} <= {*task.object_names}:
+        return None
+    if brought or (by_hand and f"<{parsed.target}>" in text):
+        return Query((Clause(moved, by_hand or "near", str(target)),))
+    return None
 
 
 # "it" right after the verb; elsewhere ("close around it") the condition identifies the object.
