@@ -22,7 +22,7 @@ _NO_ACTION = {
     "if", "when", "while", "until", "condition", "check", "name", "type", "next", "to", "initial", "start",
     "all", "any", "and", "or", "not",
 }  # fmt: skip
-_VERBS = "close|move|lower|lift|raise|carry|push|pull|slide|sweep|stop|keep moving|drag|turn|open(?! *,)"
+_VERBS = "close|move|lower|lift|raise|carry(?! on)|push|pull|slide|sweep|stop|keep moving|drag|turn|open(?! *,)"
 _IMPERATIVE = re.compile(
     rf"(?:^|[.:;] |, (?:first )?|\band |\bthen )((?:{_VERBS})\b[^.,;:]*?)(?=[.,;:]| and (?:{_VERBS}|go)\b|$)",
     re.IGNORECASE | re.MULTILINE,

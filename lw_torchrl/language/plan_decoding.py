@@ -176,7 +176,9 @@ def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) 
             if group[1] is SentenceReading and all(clause.condition in (TRUE, FALSE) for clause in other[1].clauses):
                 other = first  # prose without any condition is not a plan
             empty.append(other)
-            best = max(first, other, key=lambda pair: (_kept(pair[1]), -len(_section_notes(*pair, mapper.task))))
+            best = max(
+                first, other, key=lambda pair: (_kept(pair[1]), -len(_section_notes(pair[0], pair[1], mapper.task)))
+            )
         if best[1].clauses:
             if number and read is not None:
                 best[0].note(best[1].clauses[0].line, "the plan is not in the requested format")

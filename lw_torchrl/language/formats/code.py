@@ -377,8 +377,8 @@ class _Scope:
             case ast.Constant(value=str(value)):
                 return value
             case ast.Name(id=name):
-                value = self.values.get(name)
-                return value if isinstance(value, str | _Choice) else None
+                known = self.values.get(name)
+                return known if isinstance(known, str | _Choice) else None
             case ast.JoinedStr(values=values):
                 return _joined([text for each in values if (text := self.argument(each)) is not None], "")
             case ast.FormattedValue(value=value):
@@ -407,8 +407,8 @@ class _Scope:
                 return TRUE if value else FALSE
             case ast.Constant(value=int(value)):
                 return TRUE if value else FALSE
-            case ast.Name(id=name) if isinstance(value := self.values.get(name), Expression):
-                return value
+            case ast.Name(id=name) if isinstance(known := self.values.get(name), Expression):
+                return known
             case ast.Compare(left=left, ops=[ast.Is() | ast.Eq()], comparators=[ast.Constant(value=bool(value))]):
                 return self.condition(left) if value else negate(self.condition(left))
             case ast.Compare(left=left, ops=[ast.Is() | ast.Eq() | ast.NotEq() as op], comparators=[right]):
@@ -420,10 +420,10 @@ class _Scope:
                 return (any_of if name == "any" else all_of)(self.parts(argument))
             case ast.Call(func=ast.Name(id="bool"), args=[argument]):
                 return self.condition(argument)
-            case ast.Call(func=ast.Name(id=name), args=args) if isinstance(value := self.values.get(name), ast.Lambda):
-                names = [each.arg for each in value.args.args]
+            case ast.Call(func=ast.Name(id=name), args=args) if isinstance(known := self.values.get(name), ast.Lambda):
+                names = [each.arg for each in known.args.args]
                 inner = {key: self.value(each) for key, each in zip(names, args, strict=False)}
-                return _Scope(self.module, self.values | inner).condition(value.body) if self.count(1) else FALSE
+                return _Scope(self.module, self.values | inner).condition(known.body) if self.count(1) else FALSE
             case ast.Call() if name := self.module.helper(node):
                 if (scope := self.inner(node, name)) is not None:
                     self.module.stack.append(name)

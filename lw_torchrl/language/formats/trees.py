@@ -48,8 +48,9 @@ class TreeReading(Reading):
             except (RecursionError, ValueError):
                 self.error = "the tree is too large or nests too deeply"
                 continue
+            is_listing = isinstance(value, list) and not any(isinstance(each, dict | list) for each in value)
             texts = [action.text.split() for action in actions_of(node)]
-            if node is not None and texts and (isinstance(value, dict) or all(map(is_verb, texts))):
+            if node is not None and texts and (not is_listing or all(map(is_verb, texts))):
                 self.add_tree("", start + 1, node)
 
 
@@ -93,7 +94,7 @@ def _yaml(text: str) -> Any:
     if len(_YAML.findall(text)) < 2:
         return None
     with suppress(ImportError):
-        import yaml
+        import yaml  # type: ignore[import-untyped]
 
         with suppress(yaml.YAMLError, ValueError, RecursionError):
             return yaml.load(text, getattr(yaml, "CBaseLoader", yaml.BaseLoader))
