@@ -19,7 +19,7 @@ from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import STATES, comparisons
 from lw_torchrl.language.roles import BY_HAND, VECTORS, Direction, Manner, StepRole, Verb, motion_of
-from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, is_held, is_obstacle, parse_steps
+from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, is_free, is_obstacle, parse_steps
 from lw_torchrl.language.tasks import (
     Task,
     first_object,
@@ -129,7 +129,7 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     """
     task, parsed = plan.definition, parse_steps(plan)
     read = _with_roles(plan, parsed)
-    confidence, motion = _confidence(task, read), motion_of([_role(step) for step in read])
+    confidence, motion = _confidence(task, read), _final_motion(task, read)
     source: Source
     if confidence >= MIN_CONFIDENCE and _is_complete(read):
         source, steps = "plan", read
@@ -264,6 +264,13 @@ def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
     return direct
 
 
+def _final_motion(task: Task, steps: Sequence[PlanStep]) -> StepRole | None:
+    """Return the motion that ends at the goal, in a plan in any order; otherwise the last motion."""
+    roles = [_role(step) for step in steps]
+    to_goal = [role for role in roles if role.verb in ("carry", "move") and is_goal(task, role.target)]
+    return motion_of(to_goal or roles)
+
+
 def _is_complete(steps: Sequence[PlanStep]) -> bool:
     """Return whether a plan has a motion and, if the motion needs a grasp, first approaches and grasps the object."""
     roles = [_role(step) for step in steps]
@@ -307,7 +314,7 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
             by_hand("approach", "grasp", _negated(above), away),
             by_hand("descend", "grasp", above, away),
             by_hand("close", "grasp", near, _gripper_is("open")),
-            *(_own_motions(steps, held) or [_step(held, motion)]),
+            *(_own_motions(task, steps, held) or [_step(held, motion)]),
         )
     way, motion = motion.direction, replace(motion, target=point)
     if motion.manner == "press":
@@ -319,18 +326,32 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
     return *approach, _step(near, motion)
 
 
-def _own_motions(steps: Sequence[PlanStep], held: Query) -> list[PlanStep]:
+def _own_motions(task: Task, steps: Sequence[PlanStep], held: Query) -> list[PlanStep]:
     """Return the plan's own motions of a held object, if there are several, with ``held`` instead of their conditions
     on the gripper. The last one is also active where no other is.
     """
-    moving = [step for step in steps if _role(step).verb in ("carry", "move") and is_held(step)]
-    if len({(_role(step).moved, _role(step).target, _role(step).direction) for step in moving}) < 2:
+    moving = _lifted(task, [step for step in steps if _role(step).verb in ("carry", "move") and not is_free(step)])
+    distinct = {(_role(step).moved, _role(step).target, _role(step).direction) for step in moving}
+    if len(distinct) < 2 or any(map(is_obstacle, task.object_names)):  # an object is lifted over an obstacle
         return []
     guards = [_without_gripper(step.condition) for step in moving]
     guards[-1] = any_of([guards[-1], negate(any_of(guards))])
     return [
         _step(Query(all_of([held.expression, guard])), _role(step)) for step, guard in zip(moving, guards, strict=True)
     ]
+
+
+def _lifted(task: Task, steps: Sequence[PlanStep]) -> list[PlanStep]:
+    """Turn "lift the wrench up" into a carry to the target of the next motion of the same object, if there is one."""
+    direct = list(steps)
+    for number, step in enumerate(steps):
+        role = _role(step)
+        others = (_role(other) for other in (*steps[number + 1 :], *steps[:number]))
+        same = (other for other in others if other.direction is None and same_object(task, other.moved, role.moved))
+        after = next(same, None)
+        if role.direction == "up" and after is not None:
+            direct[number] = _step(step.condition, replace(after, verb="carry", written=role.written))
+    return direct
 
 
 def _without_gripper(condition: Query) -> Expression:

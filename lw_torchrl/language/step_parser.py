@@ -21,6 +21,10 @@ _PLACES = {name: frozenset(words) for name, words in WORDS["canonical"]["places"
 _KNOWN = frozenset().union(*_VERBS.values()) | {"align", "slide", "sweep"}
 # The purpose in "put the gripper above the dial to turn it left", which a later step of the plan carries out.
 _PURPOSE = re.compile(r"(?<=>) (?:in order )?to \w+ it\b.*")
+_IDLE = re.compile(
+    r"(?:stop|wait|pause|finish|done|stay|rest|idle|hold|pass|return|success|(?:do|keep|hold|be) (?:nothing|still))"
+    r"(?: (?:here|still|moving|there|now|put))*"
+)
 _TOOL = re.compile(r"(?<!line )(?<!level )(?<!aligned )\bwith <([^>]*)>")
 
 
@@ -71,10 +75,10 @@ class _Facts:
         return cls(near=compared_with_gripper(step), **facts)
 
 
-def is_held(step: PlanStep) -> bool:
-    """Return whether a step's condition states that the closed gripper is at an object."""
+def is_free(step: PlanStep) -> bool:
+    """Return whether a step's condition states that the gripper is open, or not at an object."""
     facts = _Facts.of(step)
-    return facts.closed and facts.at and not facts.open
+    return facts.open or facts.not_at or facts.not_aligned
 
 
 def is_obstacle(name: str) -> bool:
@@ -136,7 +140,7 @@ def _last_clause(text: str) -> str:
 
 def _parse(plan: ConditionalPlan, texts: list[str], facts: list[_Facts]) -> tuple[ParsedStep | None, ...]:
     task, each = plan.definition, list(zip(plan.steps, texts, facts, strict=True))
-    grasping = any(_grasps(text, fact) for _, text, fact in each)
+    grasping = any(_grasps(text, fact, number == 0) for number, (_, text, fact) in enumerate(each))
     parsed = [_StepParser(step, task, text, fact, grasping).parse() for step, text, fact in each]
     if all(step is None or step.verb in ("approach", "descend", "beside") for step in parsed):
         parsed = [_only_sent(step, text) for step, text in zip(parsed, texts, strict=True)]
@@ -164,16 +168,16 @@ def _only_sent(step: ParsedStep | None, text: str) -> ParsedStep | None:
     return replace(step, verb="reach") if step and goes_to else step
 
 
-def _is_fist(text: str, facts: _Facts) -> bool:
+def _is_fist(text: str, facts: _Facts, is_first: bool) -> bool:
     """Return whether "close the gripper" closes it before it is at an object, to push with closed fingers."""
     is_bare = text.startswith("close ") and "<" not in text.replace(f"<{GRIPPER}>", "")
-    return is_bare and bool(facts.near) and not facts.at
+    return is_bare and (bool(facts.near) or is_first) and not facts.at
 
 
-def _grasps(text: str, facts: _Facts) -> bool:
+def _grasps(text: str, facts: _Facts, is_first: bool) -> bool:
     """Return whether a step grasps or carries an object, or has the condition of a closed gripper at an object."""
     verb, *rest = text.split()
-    if _is_fist(text, facts):
+    if _is_fist(text, facts, is_first):
         return False
     if verb in _VERBS["held"] and rest and rest[0].startswith("<") and not text.startswith(f"{verb} <{GRIPPER}>"):
         return True
@@ -225,7 +229,7 @@ class _StepParser:
             target = self.named[-1] if elsewhere else GOAL
             return ParsedStep("hold" if self.verb in _VERBS["hold"] else "reach", GRIPPER, target)
         noun = self.named[0] if self.named else self.near
-        if noun is None:
+        if noun is None or _IDLE.fullmatch(self.text):
             return None
         if is_goal(self.task, noun) and not self.by_hand and self.verb not in _VERBS["go"]:
             at_goal = self.near is None or is_goal(self.task, self.near)
@@ -234,7 +238,7 @@ class _StepParser:
         opens = self.verb in _VERBS["open"] and GRIPPER in self.text and not self.words & {"around", "onto", "on"}
         if opens or self.verb == "release":
             return ParsedStep("open", GRIPPER, noun)
-        if _is_fist(self.text, self.facts) and not self.grasping:
+        if not self.grasping and _is_fist(self.text, self.facts, is_first=True):
             return ParsedStep("approach", GRIPPER, noun, confidence=0.5)
         if self.verb in _VERBS["close"] and (self.verb != "close" or GRIPPER in self.text or self.grasping):
             return self._closed(noun)
@@ -279,6 +283,8 @@ class _StepParser:
         if is_obstacle(noun) and not self.grasping:  # "move forward over the wall"
             return ParsedStep("approach", GRIPPER, noun)
         target = self._target(noun)
+        if (both := re.search(rf"<{re.escape(noun)}> and <([^>]*)>", self.text)) and self.verb in _VERBS["pull"]:
+            noun = both[1]  # "pull <stick> and <thermos>": the stick is the tool
         moved = self.tool if self.tool is not None and (target is None or not is_goal(self.task, target)) else noun
         if target is not None:
             moved = self._compared_point(moved, target)
@@ -308,6 +314,8 @@ class _StepParser:
         if goals := [name for name in self.named if is_goal(self.task, name)]:
             return goals[-1]
         for name in reversed(self.named[1:] if self.tool is None else self.named):
+            if is_obstacle(name):
+                continue
             if not same_object(self.task, name, noun) or self.tool is not None:
                 return name
         own, target = self.tool or noun, None
