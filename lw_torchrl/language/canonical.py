@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import read_toml
-from lw_torchrl.language.expressions import evaluate, leaves, negate, replace_leaves
+from lw_torchrl.language.expressions import Expression, all_of, any_of, evaluate, leaves, negate, replace_leaves
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import GOAL, GRIPPER, Coordinate
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import STATES, comparisons
 from lw_torchrl.language.roles import BY_HAND, VECTORS, Direction, Manner, StepRole, Verb, motion_of
-from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, parse_steps
+from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, is_free, is_obstacle, parse_steps
 from lw_torchrl.language.tasks import (
     Task,
     first_object,
@@ -129,7 +129,7 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     """
     task, parsed = plan.definition, parse_steps(plan)
     read = _with_roles(plan, parsed)
-    confidence, motion = _confidence(task, read), motion_of([_role(step) for step in read])
+    confidence, motion = _confidence(task, read), _final_motion(task, read)
     source: Source
     if confidence >= MIN_CONFIDENCE and _is_complete(read):
         source, steps = "plan", read
@@ -256,13 +256,19 @@ def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
     for number, step in enumerate(steps):
         role = _role(step)
         later = (_role(other) for other in steps[number + 1 :])
-        after = next((other for other in later if other.verb in ("carry", "move")), None)
+        moving = (other for other in later if other.verb in ("carry", "move"))
+        after = next((other for other in moving if not same_object(task, role.target, other.target)), None)
         is_fixed = not any(isinstance(at, int) for at in role_object(task, role.target).position)
-        if role.verb != "carry" or not is_fixed or after is None or same_object(task, role.target, after.target):
-            continue
-        if same_object(task, role.moved, after.moved):
-            direct[number] = _step(step.condition, replace(role, moved=after.moved, target=after.target))
+        if role.verb in ("carry", "move") and is_fixed and after and same_object(task, role.moved, after.moved):
+            direct[number] = _step(step.condition, replace(role, verb="carry", moved=after.moved, target=after.target))
     return direct
+
+
+def _final_motion(task: Task, steps: Sequence[PlanStep]) -> StepRole | None:
+    """Return the motion that ends at the goal, in a plan in any order; otherwise the last motion."""
+    roles = [_role(step) for step in steps]
+    to_goal = [role for role in roles if role.verb in ("carry", "move") and is_goal(task, role.target)]
+    return motion_of(to_goal or roles)
 
 
 def _is_complete(steps: Sequence[PlanStep]) -> bool:
@@ -294,18 +300,21 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
 
     # Complete a pull as a grasp, which also holds objects that the fingers cannot hook.
     if motion.manner in ("grasp", "pull"):
-        held = object_of(task, point)
+        moved = object_of(task, point)
         if motion.verb == "pull":
             way = motion.direction if motion.direction in VECTORS else None
-            goal = held if way else GOAL
-            motion = replace(motion, verb="move", manner="grasp", moved=held, target=goal, direction=way)
+            goal = moved if way else GOAL
+            motion = replace(motion, verb="move", manner="grasp", moved=moved, target=goal, direction=way)
         elif motion.moved == GRIPPER:
-            motion = replace(motion, moved=held)
+            motion = replace(motion, moved=moved)
+        if motion.verb == "move" and steps and any(map(is_obstacle, task.object_names)):
+            motion = replace(motion, verb="carry")
+        held = Query((*near.clauses, *_gripper_is("closed").clauses))
         return (
             by_hand("approach", "grasp", _negated(above), away),
             by_hand("descend", "grasp", above, away),
             by_hand("close", "grasp", near, _gripper_is("open")),
-            _step(Query((*near.clauses, *_gripper_is("closed").clauses)), motion),
+            *(_own_motions(task, steps, held) or [_step(held, motion)]),
         )
     way, motion = motion.direction, replace(motion, target=point)
     if motion.manner == "press":
@@ -315,6 +324,42 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
         return by_hand("beside", "push", _negated(level), way=way), _step(level, motion)
     approach = by_hand("approach", "push", _negated(over), way=way), by_hand("beside", "push", over, away, way=way)
     return *approach, _step(near, motion)
+
+
+def _own_motions(task: Task, steps: Sequence[PlanStep], held: Query) -> list[PlanStep]:
+    """Return the plan's own motions of a held object, if there are several, with ``held`` instead of their conditions
+    on the gripper. The last one is also active where no other is.
+    """
+    moving = _lifted(task, [step for step in steps if _role(step).verb in ("carry", "move") and not is_free(step)])
+    distinct = {(_role(step).moved, _role(step).target, _role(step).direction) for step in moving}
+    if len(distinct) < 2 or any(map(is_obstacle, task.object_names)):  # an object is lifted over an obstacle
+        return []
+    guards = [_without_gripper(step.condition) for step in moving]
+    guards[-1] = any_of([guards[-1], negate(any_of(guards))])
+    return [
+        _step(Query(all_of([held.expression, guard])), _role(step)) for step, guard in zip(moving, guards, strict=True)
+    ]
+
+
+def _lifted(task: Task, steps: Sequence[PlanStep]) -> list[PlanStep]:
+    """Turn "lift the wrench up" into a carry to the target of the next motion of the same object, if there is one."""
+    direct = list(steps)
+    for number, step in enumerate(steps):
+        role = _role(step)
+        others = (_role(other) for other in (*steps[number + 1 :], *steps[:number]))
+        same = (other for other in others if other.direction is None and same_object(task, other.moved, role.moved))
+        after = next(same, None)
+        if role.direction == "up" and after is not None:
+            direct[number] = _step(step.condition, replace(after, verb="carry", written=role.written))
+    return direct
+
+
+def _without_gripper(condition: Query) -> Expression:
+    """Remove the parts of a conjunction that mention the gripper."""
+    whole = condition.expression
+    parts = whole.parts if whole.kind == "all" else (whole,)
+    names = [{name for clause in leaves(part) for name in (clause.subject, clause.object)} for part in parts]
+    return all_of(part for part, mentioned in zip(parts, names, strict=True) if GRIPPER not in mentioned)
 
 
 def _touched(task: Task, roles: Sequence[StepRole]) -> str:

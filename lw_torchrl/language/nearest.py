@@ -14,7 +14,7 @@ from rapidfuzz import fuzz, process
 from lw_torchrl._util.checks import check_choice, typed
 from lw_torchrl.language.connectives import parse_words
 from lw_torchrl.language.expressions import Expression
-from lw_torchrl.language.objects import WORDS
+from lw_torchrl.language.objects import GRIPPER, WORDS
 from lw_torchrl.language.queries import (
     Clause,
     Query,
@@ -236,9 +236,15 @@ class StepMapper:
     def __init__(self, task: Task, skills: Skills | None) -> None:
         self.task, self.skills = task, skills_for(task, skills)
         self.compared = 0
+        self.mapped: dict[str, MappedQuery] = {}
 
     def query(self, text: str) -> MappedQuery:
         """Map a text to the nearest query within the limit."""
+        if text not in self.mapped:
+            self.mapped[text] = self._query(text)
+        return self.mapped[text]
+
+    def _query(self, text: str) -> MappedQuery:
         if (query := read_query(text, self.task)) is not None:
             return MappedQuery(query, 0.0, exact=True)
         self.compared += 1
@@ -263,7 +269,8 @@ class StepMapper:
 @lru_cache(maxsize=4096)
 def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
     """Return the query nearest to a condition (None if the condition has too many clauses) and the distance."""
-    words = _phrases("conditions").sub(lambda match: WORDS["conditions"][match[0]], _with_target(text, task))
+    words = _with_object(_with_target(text, task), task)
+    words = _phrases("conditions").sub(lambda match: WORDS["conditions"][match[0]], words)
     with suppress(QueryError):
         match = nearest_query(words, task)
         if len(match.parts) <= _MOST_CLAUSES:
@@ -279,6 +286,18 @@ def _with_target(text: str, task: Task) -> str:
         return goal[0] if name is None or goal[0] in task.object_names else f"the {name}"
 
     return _TARGET.sub(named, text.casefold())
+
+
+def _with_object(text: str, task: Task) -> str:
+    """Replace "it" with the last object before it: "above the mug and near it" gives "... and near the mug"."""
+    longest = sorted((name for name in task.object_names if name != GRIPPER), key=len, reverse=True)
+    names = re.compile("|".join(rf"\b{re.escape(name)}\b" for name in longest) or r"(?!)")
+
+    def named(it: re.Match[str]) -> str:
+        before = names.findall(text[: it.start()])
+        return f"the {before[-1]}" if before else it[0]
+
+    return re.sub(r"(?<=\w )it\b", named, text)
 
 
 @cache

@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 from lw_torchrl._util.checks import check_choice, counted, shown, typed
+from lw_torchrl.language.expressions import FALSE, TRUE, Expression, count_mentions, leaves, replace_leaves
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, listed_steps
+from lw_torchrl.language.formats.code import CodeReading
 from lw_torchrl.language.formats.prose import ProseReading
 from lw_torchrl.language.formats.python import PythonReading
-from lw_torchrl.language.nearest import MappedQuery, StepMapper
-from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep
-from lw_torchrl.language.queries import Query
+from lw_torchrl.language.formats.sentences import SentenceReading
+from lw_torchrl.language.formats.trees import TreeReading
+from lw_torchrl.language.nearest import LIMIT, MappedQuery, StepMapper
+from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line
+from lw_torchrl.language.programs import Done, Node, ProgramError, compile_program, tidy
+from lw_torchrl.language.queries import MOST_CLAUSES, Query
 from lw_torchrl.language.skills import Skills, canonical_skill
+from lw_torchrl.language.step_parser import skill_effect
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
 
 
@@ -61,21 +69,25 @@ _LONGEST = 65_536  # maximum number of characters to parse
 
 @typed
 def decode_plan(
-    text: str, task: str | Task, format: str, *, skills: Skills | None = None, tasks: Tasks = TASKS
+    text: str, task: str | Task, format: str | None = None, *, skills: Skills | None = None, tasks: Tasks = TASKS
 ) -> DecodedPlan:
     """Decode any text from a language model into a plan. The text is never executed, and no text raises an error.
 
     Only clauses for ``task`` are used: clauses under a function or heading with the task's name, and clauses before any
     name, which continue the prompt. If the text has several versions of the plan, the first longest version is used.
-    Thoughts, marked by ``</think>`` or the tags of other models, are ignored. Python instead of prose, or prose instead
-    of Python, is accepted.
+    Thoughts, marked by ``</think>`` or the tags of other models, are ignored. Another format than the requested one is
+    accepted.
+
+    Programs are plans, too: Python with ``elif``, ``else``, ``or``, ``while``, early ``return`` and helper functions,
+    behaviour trees, rules and state machines in JSON or YAML, and prose with "otherwise" and "repeat until". Each
+    action becomes a step whose condition is that of its path. What cannot be expressed is left out, with a note.
 
     Each clause of a condition outside the query language is replaced by the nearest query by edit distance; without a
     near query the step is dropped. ``plan`` keeps the skills as written; ``scripted`` has the nearest scripted skills.
 
     Args:
         text: the model's answer; only the first 65,536 characters and 1,000 steps are used.
-        format: the requested format, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
+        format: the requested format, a name in :data:`~lw_torchrl.PLAN_FORMATS`; None to find it by the content.
         skills: the scripted skills to choose from; None for the shipped skills.
         tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
 
@@ -88,18 +100,17 @@ def decode_plan(
     Source: paper sections 'Conditional Plan Generation' and 'LLM Experiments'.
     """
     owner = get_task(task, tasks)
-    read = PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].read
+    read = None if format is None else PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].read
     return decode_as(text, read, StepMapper(owner, skills))
 
 
-def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> DecodedPlan:
-    """Decode a plan like :func:`decode_plan`, with the format's reader ``read`` and a mapper."""
+def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapper) -> DecodedPlan:
+    """Decode a plan like :func:`decode_plan`, with a mapper and the format's reader ``read`` (None for any format)."""
     owner, notes = mapper.task, list[Note]()
     text = without_thoughts(text, notes)
     if len(text) > _LONGEST:
         notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the rest of {len(text)} characters is not read"))
-    # Models sometimes answer in a format that was not requested, so _read tries every reader.
-    reading, section = _read(text[:_LONGEST], owner, read)
+    reading, section = _read(text[:_LONGEST], mapper, read)
     if further := section.clauses[MOST_STEPS:]:
         reading.note(further[0].line, f"the plan has more than {MOST_STEPS} steps; {len(further)} are left out")
         del section.clauses[MOST_STEPS:]
@@ -124,27 +135,107 @@ def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> 
     return DecodedPlan(written, scripted, reason, tuple(sorted(notes, key=lambda note: note.line)), tuple(steps))
 
 
+def decode_program(program: str | Node, task: Task) -> DecodedPlan:
+    """Decode a program in any format, or a tree of :mod:`lw_torchrl.language.programs`, like :func:`decode_plan`."""
+    if isinstance(program, str):
+        return decode_as(program, None, StepMapper(task, None))
+
+    def read(text: str) -> Reading:
+        return Reading([Section("", 1, tree=program)])
+
+    return decode_as(" ", read, StepMapper(task, None))
+
+
 def _same(name: str, task: Task) -> bool:
     """Return whether a name is the task's name, up to case and punctuation."""
     return re.sub(r"[^a-z0-9]", "", name.lower()) == re.sub(r"[-/]", "", task.name)
 
 
-def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Reading, Section]:
-    """Try the readers in order; return the first result that has clauses for the task.
+# Models sometimes answer in a format that was not requested, so every group of readers is tried.
+_GROUPS: tuple[tuple[Callable[[str], Reading], ...], ...] = (
+    (TreeReading,),
+    (PythonReading, CodeReading),
+    (ProseReading, SentenceReading),
+)
+_CONTROL_WORDS = re.compile(r"\b(?:otherwise|or else|else,|unless)\b|\bgo (?:on |back )?to step\b", re.IGNORECASE)
 
-    Also return that result's section with the most clauses.
-    """
-    empty: list[tuple[Reading, Section]] = []
-    for reader in dict.fromkeys((read, PythonReading, ProseReading)):
-        reading = reader(text)
-        own = [reading.sections[0], *(section for section in reading.sections[1:] if _same(section.task, task))]
-        section = max(own, key=lambda section: len(section.clauses))
-        if section.clauses:
-            if empty:
-                reading.note(section.clauses[0].line, "the plan is not in the requested format")
-            return reading, section
-        empty.append((reading, section))
-    return empty[0]
+
+def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) -> tuple[Reading, Section]:
+    """Return the reading that keeps the most actions, of the first group of readers that finds any, and its section."""
+    groups = list(_GROUPS)
+    if read is not None:
+        groups = [group for group in groups if read in group] + [group for group in groups if read not in group]
+        groups = groups if read in groups[0] else [(read,), *groups]
+    empty = list[tuple[Reading, Section]]()
+    for number, group in enumerate(groups):
+        best = first = _with_clauses(group[0], text, mapper)
+        empty.append(first)
+        own = _own_lines(text, first[0], mapper.task) if ProseReading in group else text
+        if len(group) > 1 and _has_control(*first, own):
+            other = _with_clauses(group[1], own, mapper)
+            if group[1] is SentenceReading and all(clause.condition in (TRUE, FALSE) for clause in other[1].clauses):
+                other = first  # prose without any condition is not a plan
+            empty.append(other)
+            best = max(
+                first, other, key=lambda pair: (_kept(pair[1]), -len(_section_notes(pair[0], pair[1], mapper.task)))
+            )
+        if best[1].clauses:
+            if number and read is not None:
+                best[0].note(best[1].clauses[0].line, "the plan is not in the requested format")
+            return best
+    return next((pair for pair in empty if pair[0].error), empty[0])
+
+
+def _with_clauses(read: Callable[[str], Reading], text: str, mapper: StepMapper) -> tuple[Reading, Section]:
+    """Read a text, compile the programs for the task, and return the reading and its section of the most clauses."""
+
+    def effect(skill: str) -> str | None:
+        goal = mapper.query(skill.partition(" until ")[2]) if " until " in skill else None
+        if goal is not None and goal.distance <= LIMIT / 2:
+            return str(goal.query)
+        with suppress(ValueError):
+            query = skill_effect(canonical_skill(skill, mapper.task), mapper.task)
+            return None if query is None else str(query)
+        return None
+
+    try:
+        reading = read(text)
+    except (RecursionError, ProgramError) as error:
+        reading = Reading(error=str(error) if isinstance(error, ProgramError) else "the text nests too deeply")
+    own = [section for section in reading.sections if not section.task or _same(section.task, mapper.task)]
+    for section in own:
+        if section.tree is not None:
+            try:
+                steps = compile_program(section.tree, effect, lambda text: mapper.query(text).query is not None)
+            except ProgramError as error:
+                reading.error = str(error)
+                continue
+            section.clauses = [
+                Clause(step.action.line, step.guard, one_line(step.action.text), step.action.goal) for step in steps
+            ]
+    return reading, max(own or [Section("", 1)], key=_kept)
+
+
+def _kept(section: Section) -> int:
+    """Return how many clauses of a section can be active."""
+    return sum(clause.condition != FALSE for clause in section.clauses)
+
+
+def _has_control(reading: Reading, section: Section, text: str) -> bool:
+    """Return whether a text may have control flow that the reader of a published format does not understand."""
+    if isinstance(reading, PythonReading):
+        return reading.has_control or not section.clauses
+    return not section.clauses or _CONTROL_WORDS.search(text) is not None
+
+
+def _own_lines(text: str, reading: Reading, task: Task) -> str:
+    """Blank the lines of the sections for other tasks."""
+    lines = text.splitlines()
+    for section, later in zip(reading.sections, [*reading.sections[1:], None], strict=True):
+        if section.task and not _same(section.task, task):
+            for number in range(section.line - 1, len(lines) if later is None else later.line - 1):
+                lines[number] = ""
+    return "\n".join(lines)
 
 
 def _as_skill(goal: str) -> str:
@@ -164,8 +255,15 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
     def note(text: str) -> None:
         notes.append(Note(clause.line, text))
 
-    written = " ".join(clause.condition.split())
-    condition, distance, exact = mapper.query(written)
+    written = clause.condition if isinstance(clause.condition, str) else _written(clause.condition)
+    written = " ".join(written.split())
+    if isinstance(clause.condition, str):
+        condition, distance, exact = mapper.query(written)
+        unknown = [] if condition is not None else [written]
+        if condition is not None and not exact:
+            note(f"the condition {shown(written)} is read as {str(condition)!r} (distance {distance:.2f})")
+    else:
+        condition, distance, unknown = _mapped_guard(clause, mapper, notes)
     goal, goal_distance, exact_goal = mapper.query(clause.goal) if clause.goal else MappedQuery(None, 0.0)
     dropped = ""
     try:
@@ -174,9 +272,12 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
         words, dropped = " ".join(clause.skill.split()), str(error)
     scripted, skill_distance = mapper.skill(words)
     if condition is None:
-        dropped = f"no query is near enough to the condition {shown(written)} (distance {distance:.2f})"
-    elif not exact:
-        note(f"the condition {shown(written)} is read as {str(condition)!r} (distance {distance:.2f})")
+        named = "" if isinstance(clause.condition, str) else f"{shown(words)}: "
+        dropped = (
+            f"{named}no query is near enough to the condition {shown(unknown[0])} (distance {distance:.2f})"
+            if (unknown)
+            else f"{named}its condition is never true, or too long"
+        )
     if dropped:
         note(f"a step is left out: {dropped}")
     else:
@@ -192,12 +293,49 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
     return DecodedStep(clause.line, written, words, *mapped)
 
 
+def _written(guard: Expression) -> str:
+    """Write the guard of an action, unless it is too long."""
+    return str(guard) if count_mentions(guard) <= MOST_CLAUSES else f"a condition with {count_mentions(guard)} parts"
+
+
+def _mapped_guard(clause: Clause, mapper: StepMapper, notes: list[Note]) -> tuple[Query | None, float, list[str]]:
+    """Map the texts in a guard to queries; return the query, the largest distance, and the unknown texts.
+
+    A text without a near query counts as never true, so that its ``else`` is kept.
+    """
+    guard, distances, unknown = clause.condition, [0.0], list[str]()
+    assert isinstance(guard, Expression)
+
+    def query(leaf: Any) -> Expression:
+        if isinstance(leaf, Done):
+            effect = skill_effect(leaf.text, mapper.task)
+            return FALSE if effect is None else effect.expression
+        is_new = leaf not in mapper.mapped
+        mapped, distance, exact = mapper.query(leaf)
+        distances.append(distance)
+        if mapped is None:
+            unknown.append(leaf)
+        if is_new and not exact:
+            how = "counts as never true" if mapped is None else f"is read as {str(mapped)!r}"
+            notes.append(Note(clause.line, f"the condition {shown(leaf)} {how} (distance {distance:.2f})"))
+        return FALSE if mapped is None else mapped.expression
+
+    if len(leaves(guard)) > MOST_CLAUSES:
+        return None, 0.0, []
+    try:
+        mapped = tidy(replace_leaves(tidy(guard), query))
+    except ValueError:
+        return None, 1.0, []
+    fits = mapped != FALSE and count_mentions(mapped) <= MOST_CLAUSES
+    return (Query(mapped) if fits else None), max(distances), unknown
+
+
 def _section_notes(reading: Reading, section: Section, task: Task) -> list[Note]:
     """Return the parser's notes on the chosen section, and one note for each other section with clauses."""
     ends = [later.line for later in reading.sections[1:]]
     notes = []
     for other, end in zip(reading.sections, [*ends, float("inf")], strict=True):
-        if other is section or (not other.task and not other.clauses):
+        if other is section or section.tree is not None or (not other.task and not other.clauses):
             notes += [note for note in reading.notes if other.line <= note.line < end]
         elif other.clauses:
             what = "is another version" if _same(other.task, task) else "was not requested"
@@ -210,6 +348,8 @@ def _why_none(reading: Reading, steps: list[DecodedStep], task: Task, text: str)
     """Return the reason why a text has no plan."""
     if steps:
         return f"all steps for {task.name} were dropped ({len(steps)}), the first because {steps[0].dropped}"
+    if reading.error:
+        return reading.error
     if not text.strip():
         return "the text is empty"
     if others := sorted({other.task for other in reading.sections if other.clauses}):

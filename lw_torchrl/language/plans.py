@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from hashlib import sha256
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lw_torchrl._util.checks import Probability, shown, typed, typed_fields
 from lw_torchrl.language.layout import METAWORLD, Layout
@@ -17,6 +17,9 @@ from lw_torchrl.language.relations import comparisons
 from lw_torchrl.language.roles import StepRole
 from lw_torchrl.language.skills import canonical_skill, load_skills
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task, one_layout, role_object, task_ids
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.programs import Node
 
 MOST_STEPS = 1_000  # maximum number of steps of a plan; the longest shipped plan has 6
 
@@ -125,6 +128,42 @@ class ConditionalPlan:
         definition = get_task(task)
         steps = tuple(PlanStep(check_query(query, definition), skill) for query, skill in pairs)
         return cls(definition.name, steps, definition)
+
+    @classmethod
+    def from_program(cls, program: str | Node, task: str | Task) -> ConditionalPlan:
+        """Build a plan from a program with control flow; the text is parsed, never executed.
+
+        Each action becomes a step whose condition is that of its path, as :func:`~lw_torchrl.decode_plan` describes.
+        That function also reports what was left out.
+
+        Args:
+            program: Python, JSON, YAML or prose; or a tree of :mod:`lw_torchrl.language.programs`.
+
+        Raises:
+            PlanError: the program has no action for the task that can be read, or it nests too deeply.
+
+        Example:
+            >>> program = '''
+            ... def push(robot):
+            ...     held = check("the gripper is around the puck") and check("the gripper is closed")
+            ...     if held:
+            ...         robot.slide("the puck to the target location")
+            ...     elif check("the gripper is around the puck"):
+            ...         robot.close("the gripper")
+            ...     else:
+            ...         robot.move("to the puck")
+            ... '''
+            >>> for step in ConditionalPlan.from_program(program, "push").steps[1:]:
+            ...     print(step.condition, "->", step.skill)
+            the robot's gripper is not closed and the robot's gripper is around the puck -> close the gripper
+            the robot's gripper is not around the puck -> move to the puck
+        """
+        from lw_torchrl.language.plan_decoding import decode_program  # here, because it imports this module
+
+        decoded = decode_program(program, get_task(task))
+        if decoded.plan is None:
+            raise PlanError("; ".join([decoded.reason, *(str(note) for note in decoded.notes[:3])]))
+        return decoded.plan
 
     @property
     def goals(self) -> tuple[Query | None, ...]:

@@ -35,7 +35,7 @@ from lw_torchrl.language.tasks import Task, get_task
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
 _OTHERS = frozenset(("(", *CONNECTIVES)) - {"and"}
-_MOST_CLAUSES = 256  # in the text of a query
+MOST_CLAUSES = 256  # in the text of a query
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,8 @@ def split_words(text: str) -> list[str]:
     clauses = 1 + sum(joins[word] for word in ("and", "or", "nor", "unless"))
     groups = sum(joins[word] for word in OPENERS)
     for number, counted in ((clauses, "clauses"), (groups, "parentheses")):
-        if number > _MOST_CLAUSES:
-            raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} {counted}, got {number}")
+        if number > MOST_CLAUSES:
+            raise QueryError(f"query {_cut(text)!r} must have at most {MOST_CLAUSES} {counted}, got {number}")
     spaced, pattern = " ".join(words), _two_relations(tuple(RELATIONS))
     if pattern.search(spaced) is None:
         return words
@@ -326,8 +326,8 @@ def check_query(query: str | Query, task: str | Task) -> Query:
         return parse_query(query, task)
     owner = get_task(task)
     clauses = len(query.clauses) if query.is_conjunction else count_mentions(query.expression)
-    if clauses > _MOST_CLAUSES:
-        raise QueryError(f"a query must have at most {_MOST_CLAUSES} clauses when it is written, got {clauses}")
+    if clauses > MOST_CLAUSES:
+        raise QueryError(f"a query must have at most {MOST_CLAUSES} clauses when it is written, got {clauses}")
     if all(_is_of(clause, owner) for clause in query.clauses):
         return query
     return parse_query(str(query), owner)  # resolves aliases, or raises an error that explains the fault

@@ -6,9 +6,10 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
+from lw_torchrl.language.expressions import TRUE
 from lw_torchrl.language.objects import GOAL, GRIPPER, WORDS
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep
-from lw_torchrl.language.queries import Clause
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep, usual_goal
+from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.roles import Direction, Verb, mark_objects, simplify
 from lw_torchrl.language.tasks import Task, first_object, is_goal, object_of, same_object, whole_objects
 
@@ -20,6 +21,10 @@ _PLACES = {name: frozenset(words) for name, words in WORDS["canonical"]["places"
 _KNOWN = frozenset().union(*_VERBS.values()) | {"align", "slide", "sweep"}
 # The purpose in "put the gripper above the dial to turn it left", which a later step of the plan carries out.
 _PURPOSE = re.compile(r"(?<=>) (?:in order )?to \w+ it\b.*")
+_IDLE = re.compile(
+    r"(?:stop|wait|pause|finish|done|stay|rest|idle|hold|pass|return|success|(?:do|keep|hold|be) (?:nothing|still))"
+    r"(?: (?:here|still|moving|there|now|put))*"
+)
 _TOOL = re.compile(r"(?<!line )(?<!level )(?<!aligned )\bwith <([^>]*)>")
 
 
@@ -70,6 +75,17 @@ class _Facts:
         return cls(near=compared_with_gripper(step), **facts)
 
 
+def is_free(step: PlanStep) -> bool:
+    """Return whether a step's condition states that the gripper is open, or not at an object."""
+    facts = _Facts.of(step)
+    return facts.open or facts.not_at or facts.not_aligned
+
+
+def is_obstacle(name: str) -> bool:
+    """Return whether an object is named as something to move over or around."""
+    return "wall" in name.split()
+
+
 def parse_steps(plan: ConditionalPlan) -> tuple[ParsedStep | None, ...]:
     """Parse each step of a plan; a step that cannot be parsed becomes None."""
     task = plan.definition
@@ -80,6 +96,34 @@ def parse_steps(plan: ConditionalPlan) -> tuple[ParsedStep | None, ...]:
     if all(each is None or each.verb in _NO_MOTION for each in parsed):
         parsed = _parse(plan, _resolve_it([_last_clause(text) for text in marked], facts, task), facts)
     return parsed
+
+
+def skill_effect(skill: str, task: Task) -> Query | None:
+    """Return the state that a skill makes true, such as "the gripper is open"; None if no query expresses that state.
+
+    Example:
+        >>> from lw_torchrl import TASKS
+        >>> print(skill_effect("move above the puck", TASKS["push"]))
+        the robot's gripper is above the puck
+    """
+    if (goal := usual_goal(skill, task)) is not None:
+        return goal
+    step, text = PlanStep(Query(TRUE), skill), simplify(mark_objects(skill, task))
+    parsed = _StepParser(step, task, text, _Facts.of(step), grasping=True).parse()
+    if parsed is None or parsed.moved is None or parsed.confidence < 0.6:
+        return None
+    if parsed.verb in ("open", "close"):
+        return Query((Clause(GRIPPER, "open" if parsed.verb == "open" else "closed"),))
+    moved, target = parsed.moved, parsed.target
+    by_hand = {"approach": "above", "descend": "near", "reach": "near"}.get(parsed.verb)
+    brought = parsed.verb in ("carry", "move") and re.search(rf"\b(?:to|onto|into) <{re.escape(str(target))}>", text)
+    if target == GOAL:
+        target = next((name for name in task.object_names if is_goal(task, name)), None)
+    if parsed.direction or target == moved or not {moved, target} <= {*task.object_names}:
+        return None
+    if brought or (by_hand and f"<{parsed.target}>" in text):
+        return Query((Clause(moved, by_hand or "near", str(target)),))
+    return None
 
 
 # "it" right after the verb; elsewhere ("close around it") the condition identifies the object.
@@ -96,7 +140,7 @@ def _last_clause(text: str) -> str:
 
 def _parse(plan: ConditionalPlan, texts: list[str], facts: list[_Facts]) -> tuple[ParsedStep | None, ...]:
     task, each = plan.definition, list(zip(plan.steps, texts, facts, strict=True))
-    grasping = any(_grasps(text, fact) for _, text, fact in each)
+    grasping = any(_grasps(text, fact, number == 0) for number, (_, text, fact) in enumerate(each))
     parsed = [_StepParser(step, task, text, fact, grasping).parse() for step, text, fact in each]
     if all(step is None or step.verb in ("approach", "descend", "beside") for step in parsed):
         parsed = [_only_sent(step, text) for step, text in zip(parsed, texts, strict=True)]
@@ -124,9 +168,17 @@ def _only_sent(step: ParsedStep | None, text: str) -> ParsedStep | None:
     return replace(step, verb="reach") if step and goes_to else step
 
 
-def _grasps(text: str, facts: _Facts) -> bool:
+def _is_fist(text: str, facts: _Facts, is_first: bool) -> bool:
+    """Return whether "close the gripper" closes it before it is at an object, to push with closed fingers."""
+    is_bare = text.startswith("close ") and "<" not in text.replace(f"<{GRIPPER}>", "")
+    return is_bare and (bool(facts.near) or is_first) and not facts.at
+
+
+def _grasps(text: str, facts: _Facts, is_first: bool) -> bool:
     """Return whether a step grasps or carries an object, or has the condition of a closed gripper at an object."""
     verb, *rest = text.split()
+    if _is_fist(text, facts, is_first):
+        return False
     if verb in _VERBS["held"] and rest and rest[0].startswith("<") and not text.startswith(f"{verb} <{GRIPPER}>"):
         return True
     return (verb in _VERBS["close"] and (verb != "close" or GRIPPER in text)) or (facts.closed and facts.at)
@@ -177,7 +229,7 @@ class _StepParser:
             target = self.named[-1] if elsewhere else GOAL
             return ParsedStep("hold" if self.verb in _VERBS["hold"] else "reach", GRIPPER, target)
         noun = self.named[0] if self.named else self.near
-        if noun is None:
+        if noun is None or _IDLE.fullmatch(self.text):
             return None
         if is_goal(self.task, noun) and not self.by_hand and self.verb not in _VERBS["go"]:
             at_goal = self.near is None or is_goal(self.task, self.near)
@@ -186,6 +238,8 @@ class _StepParser:
         opens = self.verb in _VERBS["open"] and GRIPPER in self.text and not self.words & {"around", "onto", "on"}
         if opens or self.verb == "release":
             return ParsedStep("open", GRIPPER, noun)
+        if not self.grasping and _is_fist(self.text, self.facts, is_first=True):
+            return ParsedStep("approach", GRIPPER, noun, confidence=0.5)
         if self.verb in _VERBS["close"] and (self.verb != "close" or GRIPPER in self.text or self.grasping):
             return self._closed(noun)
         return self._by_hand() if self.by_hand else self._object_moved(noun)
@@ -226,7 +280,11 @@ class _StepParser:
 
     def _object_moved(self, noun: str) -> ParsedStep:
         """Parse a step that moves an object."""
+        if is_obstacle(noun) and not self.grasping:  # "move forward over the wall"
+            return ParsedStep("approach", GRIPPER, noun)
         target = self._target(noun)
+        if (both := re.search(rf"<{re.escape(noun)}> and <([^>]*)>", self.text)) and self.verb in _VERBS["pull"]:
+            noun = both[1]  # "pull <stick> and <thermos>": the stick is the tool
         moved = self.tool if self.tool is not None and (target is None or not is_goal(self.task, target)) else noun
         if target is not None:
             moved = self._compared_point(moved, target)
@@ -256,6 +314,8 @@ class _StepParser:
         if goals := [name for name in self.named if is_goal(self.task, name)]:
             return goals[-1]
         for name in reversed(self.named[1:] if self.tool is None else self.named):
+            if is_obstacle(name):
+                continue
             if not same_object(self.task, name, noun) or self.tool is not None:
                 return name
         own, target = self.tool or noun, None

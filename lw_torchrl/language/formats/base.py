@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
+from typing import Any
 
+from lw_torchrl._util.files import read_toml
+from lw_torchrl.language.expressions import Expression
+from lw_torchrl.language.objects import WORDS
 from lw_torchrl.language.plans import ConditionalPlan
+from lw_torchrl.language.programs import Action, Node
+from lw_torchrl.language.programs import Sequence as InTurn
 from lw_torchrl.language.tasks import Task
 
 
@@ -33,6 +40,9 @@ class PlanFormat:
     style: Style = Style()  # used for models that are constrained to a JSON Schema
 
 
+PROGRAM_WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "programs.toml", ValueError)
+"""The words by which the readers recognise programs."""
+
 STYLES = {"basic": Style(), "chain": Style(explains=True), "goal": Style(explains=True, goals=True)}
 """The paper's three styles, by name."""
 
@@ -56,7 +66,7 @@ class Clause:
     """A condition and its skill, as written in a text."""
 
     line: int  # line number of the condition, from 1
-    condition: str  # "the robot's gripper is not above mug"
+    condition: str | Expression  # "the robot's gripper is not above mug", or an expression over such texts
     skill: str  # "put gripper above mug"; "" if there is only a goal
     goal: str = ""  # the state to reach, "the robot's gripper is above mug"
     reason: str = ""  # the comment before the clause
@@ -70,6 +80,7 @@ class Section:
     line: int  # the section's first line
     clauses: list[Clause] = field(default_factory=list)  # in the order of the text
     listed: str = ""  # the list of steps before the clauses, "1. first  2. second"
+    tree: Node | None = None  # a program with control flow, which is compiled into clauses
 
 
 @dataclass
@@ -78,6 +89,7 @@ class Reading:
 
     sections: list[Section] = field(default_factory=lambda: [Section("", 1)])
     notes: list[Note] = field(default_factory=list)
+    error: str = ""  # why the text cannot be read as a program
 
     @property
     def section(self) -> Section:
@@ -87,6 +99,10 @@ class Reading:
     def note(self, line: int, text: str) -> None:
         """Append a note on a line."""
         self.notes.append(Note(line, text))
+
+    def add_tree(self, task: str, line: int, tree: Node) -> None:
+        """Append a section with a program."""
+        self.sections.append(Section(task, line, tree=tree))
 
     def open(self, task: str, line: int) -> None:
         """Begin a section for a task, unless a ``def`` follows right below a heading for the same task."""
@@ -107,3 +123,58 @@ def item(text: str) -> tuple[int, str] | None:
     """Parse a list item such as "1. Put the gripper above the mug" into (number, text); return None for other text."""
     match = _ITEM.fullmatch(text)
     return (int(match[1]), match[2].strip()) if match else None
+
+
+_CANONICAL = WORDS["canonical"]
+_VERBS = frozenset(
+    [*PROGRAM_WORDS["verbs"], *_CANONICAL["goes"]]
+    + [word for table in ("synonyms", "verbs") for verb, words in _CANONICAL[table].items() for word in (verb, *words)]
+)
+
+
+def is_verb(words: Sequence[str]) -> bool:
+    """Return whether the first word is a verb that an action can begin with."""
+    return bool(words) and words[0].casefold() in _VERBS
+
+
+def words_of(name: str) -> list[str]:
+    """Split an identifier into lower-case words: "move_to" and "moveTo" give ["move", "to"]."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name).replace("_", " ").replace("-", " ").lower().split()
+
+
+def task_name(name: str) -> str:
+    """Convert a function's name to a task's name: "door_lock" and "DoorLock" give "door-lock"."""
+    return "-".join(words_of(name)) or "?"
+
+
+def is_for_any_task(name: str) -> bool:
+    """Return whether a function's name names no task: "policy", "step"."""
+    return " ".join(words_of(name)) in PROGRAM_WORDS["any_task"]
+
+
+_FENCE = re.compile(r"^[ \t]*(?:```|~~~).*$", re.MULTILINE)
+
+
+def code_blocks(text: str) -> Iterator[tuple[int, str]]:
+    """Yield (number of lines before, text) of each fenced block, or of the whole text if there is no fence."""
+    if end := END.search(text):
+        text = text[: end.start()]
+    fences = [(match.start(), match.end()) for match in _FENCE.finditer(text)]
+    if not fences:
+        yield 0, text
+    for (_, start), (end_at, _) in zip(fences[::2], [*fences[1::2], (len(text), 0)], strict=False):
+        yield text.count("\n", 0, start), text[start:end_at]
+
+
+_AND = re.compile(r",?\s(?:and|then)(?:\sthen)?\s(?=(\w+))")
+
+
+def in_turn(text: str, line: int) -> Node:
+    """Return the actions that a text joins: "open the gripper and move above the puck" gives two, in turn."""
+    parts, start = list[Node](), 0
+    for match in _AND.finditer(text):
+        if match[1].lower() in PROGRAM_WORDS["motions"]:
+            parts.append(Action(text[start : match.start()], line))
+            start = match.end()
+    parts.append(Action(text[start:], line))
+    return parts[0] if len(parts) == 1 else InTurn(tuple(parts))

@@ -61,7 +61,7 @@ _SHOULD = re.compile(
 _UNTIL = re.compile(r",?\s(?:then\s)?move\s(?:the\s)?(?:robot's\s)?gripper\suntil\s", re.IGNORECASE)
 _COMMA = re.compile(r",\s(?:then\s)?")
 # A sentence that begins with one of these words after "When C, " is not a skill.
-_NO_SKILL = frozenset(("the", "a", "an", "it", "this", "that", "you", "we", "they", "there", "and", "or"))
+NO_SKILL = frozenset(("the", "a", "an", "it", "this", "that", "you", "we", "they", "there", "and", "or"))
 
 
 def _is_read(line: str) -> bool:
@@ -157,7 +157,7 @@ def _clause(number: int, line: str, bullet: bool) -> Clause | None:
     if not bullet or not comma:
         return None
     skill = _ended(rest[comma.end() :])
-    if skill.partition(" ")[0].lower() in _NO_SKILL:
+    if skill.partition(" ")[0].lower() in NO_SKILL:
         return None
     return Clause(number, rest[: comma.start()], skill)
 

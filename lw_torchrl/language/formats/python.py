@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from lw_torchrl._util.checks import shown
-from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item
+from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item, task_name
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep, function_head, one_line, quote
 from lw_torchrl.language.queries import Query
@@ -94,6 +94,7 @@ _CHECK = re.compile(rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check
 _CALL = re.compile(r"(?:self\.)?robot\.(\w+)\s*\(\s*")
 # A comment that may begin the section of a task: "# drawer-open: ...".
 _HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
+_CONTROL = re.compile(r"(?:return|break|continue)\b|[a-z_]\w*\s*=(?!=)|(?:elif|else)\b")
 _MOST_JOINED = 6  # maximum number of lines of a statement
 
 
@@ -116,6 +117,7 @@ class PythonReading(Reading):
         self.reason: list[str] = []
         self.listing = False
         self.is_outside = False  # whether the last line was not part of a plan
+        self.has_control = False  # whether the text has control flow that only CodeReading understands
         for number, line in _statements(text):
             if not self.read(number, line):
                 break
@@ -139,7 +141,7 @@ class PythonReading(Reading):
         """Parse a comment: a heading, a list of steps, or a reason."""
         words = line.strip().lstrip("#")
         numbered, heading = item(words), _HEADING.match(line)
-        if heading and (name := _task_name(heading[1])) in TASKS:
+        if heading and (name := task_name(heading[1])) in TASKS:
             self.open(name, number)
         elif re.fullmatch(r"\s*steps\s*:?\s*", words, re.IGNORECASE):
             self.listing = True
@@ -170,7 +172,7 @@ class PythonReading(Reading):
                 break
             self.blocks.pop()
         if definition := _DEF.match(code):
-            self.open(_task_name(definition[1]), number)
+            self.open(task_name(definition[1]), number)
         elif branch:
             self.branch(number, indent, code, branch)
         elif call:
@@ -180,6 +182,7 @@ class PythonReading(Reading):
         else:
             if not self.is_outside:  # one note for consecutive lines
                 self.note(number, f"the text is not part of a plan: {shown(code)}")
+            self.has_control |= _CONTROL.match(code) is not None and (bool(self.blocks) or "=" in code)
             self.is_outside = True
             return
         self.is_outside = False
@@ -189,8 +192,10 @@ class PythonReading(Reading):
         condition, rest = (None, code[branch.end() :]) if branch[2] else self.condition(number, code, branch.end())
         if branch[2]:
             self.note(number, "'else' has no condition; the skills under it are left out")
+            self.has_control = True
         if branch[1] == "elif":
             self.note(number, "'elif' is read as 'if', without the negation of the conditions above")
+            self.has_control = True
         if self.blocks and self.blocks[-1].body is None:
             self.blocks[-1].body = indent
         self.blocks.append(_Block(indent, number, condition))
@@ -218,6 +223,7 @@ class PythonReading(Reading):
             fault = fault or (f'expected only check("..."), got {shown(code)}' if rest else "")
         if fault:
             self.note(number, fault)
+            self.has_control = True
         return (None if fault else " and ".join(conditions)), rest.lstrip(": ")
 
     def call(self, number: int, indent: int, code: str, call: re.Match[str]) -> None:
@@ -235,22 +241,24 @@ class PythonReading(Reading):
             return
         if not self.blocks:
             self.note(number, f"a skill without a condition is left out: {shown(code)}")
+            self.has_control = True
             return
         block = self.blocks[-1]
         if self.section.clauses and self.section.clauses[-1].line == block.line:
             self.note(number, "a second skill under the same condition becomes a separate step")
+            self.has_control = True
         block.body = indent if block.body is None else block.body
         conditions = [above.condition for above in self.blocks if above.condition is not None]
         if len(conditions) < len(self.blocks):
             return  # the note on the `if` gives the reason
         skill, goal = f"{call[1]} {' '.join(words)}", named.get("goal", "")
         if call[1] == "move_gripper":
-            skill, goal = _state_to_reach(" ".join(words), named)
+            skill, goal = state_to_reach(" ".join(words), named)
         self.section.clauses.append(Clause(block.line, " and ".join(conditions), skill, goal, " ".join(self.reason)))
         self.reason.clear()
 
 
-def _state_to_reach(place: str, named: dict[str, str]) -> tuple[str, str]:
+def state_to_reach(place: str, named: dict[str, str]) -> tuple[str, str]:
     """Return (skill, goal) for a call of ``robot.move_gripper``; either the skill or the goal is empty."""
     parts = [f"the {GRIPPER} is {place}"] if place else []
     parts += [text for name in ("until", "goal") if (text := named.get(name, ""))]
@@ -264,11 +272,6 @@ def _unquoted(strings: str) -> str:
     """Return the content of adjacent string literals."""
     bodies = [literal.lstrip("fFrRbBuU")[1:-1] for literal in re.findall(_STRING, strings)]
     return " ".join("".join(re.sub(r"\\(.)", r"\1", body) for body in bodies).split())
-
-
-def _task_name(name: str) -> str:
-    """Convert a function's name to a task's name: "door_lock" and "DoorLock" give "door-lock"."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).replace("_", "-").strip("-").lower() or "?"
 
 
 def _statements(text: str) -> Iterator[tuple[int, str]]:

@@ -1,0 +1,317 @@
+"""Programs: a plan's control flow as a tree, and the compiler that turns the tree into guarded actions.
+
+The readers of :mod:`lw_torchrl.language.formats` build trees from Python, JSON, YAML and prose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, leaves, negate
+
+MOST_DEPTH = 60  # maximum nesting of a program, without counting ``elif``
+_BREAK = "break"
+
+
+class ProgramError(ValueError):
+    """The error for a program that is too deep or too large to compile."""
+
+
+@dataclass(frozen=True)
+class Action:
+    """A skill to carry out."""
+
+    text: str  # "move above the puck"
+    line: int = 1  # line number in the text, from 1
+    goal: str = ""  # the state to reach, as written
+
+
+@dataclass(frozen=True)
+class Check:
+    """A step that succeeds while a condition is true, and fails otherwise."""
+
+    condition: Expression
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A choice between two programs; it fails if the condition is false and there is no second program."""
+
+    condition: Expression
+    then: Node
+    otherwise: Node | None = None
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Programs in turn: each waits until the previous ones succeed, and fails if one of them fails."""
+
+    parts: tuple[Node, ...] = ()
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of code: branches and loops run side by side; an action waits until all parts above it are done."""
+
+    parts: tuple[Node, ...] = ()
+
+
+@dataclass(frozen=True)
+class Selector:
+    """Alternatives: each runs if all previous ones fail.
+
+    If some alternatives are conditions, the others run until one of these conditions is true.
+    """
+
+    parts: tuple[Node, ...] = ()
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A program that runs while a condition is true; what follows waits until the condition is false."""
+
+    condition: Expression
+    body: Node
+
+
+@dataclass(frozen=True)
+class Jump:
+    """The end of the program for this control step, or a jump to a later :class:`Label`."""
+
+    label: str = ""  # "" for the end, "break" for the end of the innermost loop
+
+
+@dataclass(frozen=True)
+class Label:
+    """The place in a sequence where a :class:`Jump` continues."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Done:
+    """A leaf of a condition: the effect of an action is reached."""
+
+    text: str  # of the action
+
+
+Node: TypeAlias = Action | Check | Branch | Sequence | Block | Selector | Loop | Jump | Label
+
+
+@dataclass
+class _Flow:
+    """What follows a program, as conditions relative to the program's own guard."""
+
+    falls: Expression = TRUE  # control leaves at the end, if actions take no time
+    settles: Expression = TRUE  # all actions are done as well
+    fails: Expression = FALSE
+    jumps: dict[str, Expression] = field(default_factory=dict)  # label to the condition of a jump to it
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """An action, and the condition under which it is active."""
+
+    guard: Expression
+    action: Action
+
+
+def compile_program(
+    program: Node,
+    effect: Callable[[str], str | None] = lambda text: None,
+    known: Callable[[str], bool] = lambda text: True,
+) -> list[Guarded]:
+    """Compile a program into guarded actions, for a policy that evaluates all guards at each control step.
+
+    An action's guard is the condition of its path. Actions in turn wait for the previous action's effect; both are
+    active if that effect has no name.
+
+    Args:
+        effect: returns the condition that an action makes true ("the gripper is open"), or None if it has no name.
+        known: returns whether a condition can be evaluated; a loop with an unknown condition runs always.
+
+    Raises:
+        ProgramError: the program nests more than 60 programs, or a condition joins more than 1,000 others.
+
+    Example:
+        >>> near, far = Action("close the gripper"), Action("move to the puck")
+        >>> for step in compile_program(Branch(any_of(["near", "held"]), near, far)):
+        ...     print(step.guard, "->", step.action.text)
+        near or held -> close the gripper
+        not near and not held -> move to the puck
+    """
+    compiler = _Compiler(effect, known)
+    try:
+        compiler.run(program, TRUE, False, 0)
+    except ProgramError:
+        raise
+    except ValueError as error:
+        raise ProgramError(str(error)) from error
+    return compiler.steps
+
+
+def choose(condition: Expression, then: Expression, otherwise: Expression) -> Expression:
+    """Return "``then`` if ``condition`` else ``otherwise``" as a short expression."""
+    if then == otherwise:
+        return then
+    if then == TRUE or otherwise == TRUE:
+        return any_of([condition, otherwise]) if then == TRUE else any_of([negate(condition), then])
+    return any_of([all_of([condition, then]), all_of([negate(condition), otherwise])])
+
+
+def actions_of(program: Node | None) -> Iterator[Action]:
+    """Yield the actions of a program, in the order of the text."""
+    stack = [program]
+    while stack:
+        each = stack.pop()
+        if isinstance(each, Action):
+            yield each
+        elif isinstance(each, Branch):
+            stack += [each.otherwise, each.then]
+        elif isinstance(each, Loop):
+            stack.append(each.body)
+        elif isinstance(each, Sequence | Block | Selector):
+            stack += reversed(each.parts)
+
+
+def is_condition(node: Node) -> bool:
+    """Return whether a program consists of conditions only."""
+    if isinstance(node, Sequence | Selector):
+        return all(map(is_condition, node.parts))
+    return isinstance(node, Check)
+
+
+def tidy(guard: Expression) -> Expression:
+    """Drop the alternatives that the rest of a conjunction excludes: "a and (not a or b)" becomes "a and b".
+
+    Example:
+        >>> print(tidy(all_of(["a", any_of([negate("a"), "b"])])))
+        a and b
+    """
+    before = None
+    while guard.kind == "all" and guard != before:
+        excluded = {negate(part) for part in guard.parts if part.kind == "leaf"}
+        parts = [
+            any_of(each for each in part.parts if excluded.isdisjoint(each.parts if each.kind == "all" else (each,)))
+            if part.kind == "any"
+            else part
+            for part in guard.parts
+        ]
+        before, guard = guard, all_of(parts)
+    return guard
+
+
+class _Compiler:
+    def __init__(self, effect: Callable[[str], str | None], known: Callable[[str], bool]) -> None:
+        self.effect, self.known, self.steps = effect, known, list[Guarded]()
+
+    def run(self, node: Node, here: Expression, followed: bool, depth: int) -> _Flow:
+        """Append the guarded actions of a program with the guard ``here``.
+
+        An action that is ``followed`` by another one stops at its effect.
+        """
+        if depth > MOST_DEPTH:
+            raise ProgramError(f"a program must nest at most {MOST_DEPTH} parts; split it into steps side by side")
+        if isinstance(node, Action):
+            return self.action(node, here, followed)
+        if isinstance(node, Check):
+            return _Flow(settles=node.condition, fails=negate(node.condition))
+        if isinstance(node, Jump):
+            return _Flow(falls=FALSE, settles=FALSE, jumps={node.label: TRUE} if node.label else {})
+        if isinstance(node, Branch):
+            return self.branch(node, here, followed, depth + 1)
+        if isinstance(node, Loop):
+            return self.loop(node, here, depth + 1)
+        if isinstance(node, Selector):
+            return self.selector(node, here, followed, depth + 1)
+        if isinstance(node, Sequence | Block):
+            return self.sequence(node, here, followed, depth + 1)
+        return _Flow()
+
+    def action(self, node: Action, here: Expression, followed: bool) -> _Flow:
+        effect = self.effect(node.text)
+        done = TRUE if effect is None else all_of([effect])
+        guard = all_of([here, negate(done)]) if followed and effect is not None else here
+        self.steps.append(Guarded(guard, node))
+        return _Flow(settles=done)
+
+    def branch(self, node: Branch, here: Expression, followed: bool, depth: int) -> _Flow:
+        conditions, flows = list[Expression](), list[_Flow]()
+        last: Node | None = node
+        while isinstance(last, Branch):  # a loop, since a chain of ``elif`` may be long
+            flows.append(self.run(last.then, all_of([here, last.condition]), followed, depth))
+            here = all_of([here, negate(last.condition)])
+            conditions.append(last.condition)
+            last = last.otherwise
+        flow = _Flow(fails=TRUE) if last is None else self.run(last, here, followed, depth)
+        for condition, then in zip(reversed(conditions), reversed(flows), strict=True):
+            flow = _Flow(
+                choose(condition, then.falls, flow.falls),
+                choose(condition, then.settles, flow.settles),
+                choose(condition, then.fails, flow.fails),
+                {
+                    label: choose(condition, then.jumps.get(label, FALSE), flow.jumps.get(label, FALSE))
+                    for label in {**then.jumps, **flow.jumps}
+                },
+            )
+        return flow
+
+    def loop(self, node: Loop, here: Expression, depth: int) -> _Flow:
+        known = all(map(self.known, leaves(node.condition)))
+        condition = node.condition if known else TRUE
+        flow = self.run(node.body, all_of([here, condition]), False, depth)
+        ends = any_of([negate(condition), flow.jumps.pop(_BREAK, FALSE)])
+        if not known:
+            ends = flow.settles
+        return _Flow(ends, ends, jumps={label: all_of([condition, jump]) for label, jump in flow.jumps.items()})
+
+    def selector(self, node: Selector, here: Expression, followed: bool, depth: int) -> _Flow:
+        reached, successes, flows = TRUE, list[Expression](), list[_Flow]()
+        has_conditions = any(map(is_condition, node.parts))
+        for part in node.parts:
+            flow = self.run(part, all_of([here, reached]), followed and not has_conditions, depth)
+            if is_condition(part) or not has_conditions:
+                before = [other.fails for other, node in zip(flows, node.parts, strict=False) if not is_condition(node)]
+                successes.append(all_of([*before, flow.settles]))
+            reached = all_of([reached, flow.fails])
+            flows.append(flow)
+        return _Flow(settles=any_of(successes), fails=reached)
+
+    def sequence(self, node: Sequence | Block, here: Expression, followed: bool, depth: int) -> _Flow:
+        parts = _inlined(node)
+        waits = [number for number, part in enumerate(parts) if not isinstance(part, Jump | Label)]
+        # hard: what every later part waits for; soft: what later actions wait for; done: without failed conditions.
+        hard, soft, done, falls, fails, jumps = TRUE, TRUE, TRUE, TRUE, list[Expression](), dict[str, Expression]()
+        for number, part in enumerate(parts):
+            if isinstance(part, Label):
+                jump = jumps.pop(part.name, FALSE)
+                hard, soft = any_of([all_of([hard, soft]), jump]), TRUE
+                falls = any_of([falls, jump])
+                continue
+            is_action, beside = isinstance(part, Action), isinstance(node, Block) and isinstance(part, Branch)
+            guard = all_of([here, hard, soft] if is_action or not isinstance(node, Block) else [here, hard])
+            later = [parts[other] for other in waits if other > number]
+            ends = any(isinstance(other, Jump) and not other.label for other in parts[number:])
+            stops = (followed and not ends) or any(not beside or isinstance(other, Action) for other in later)
+            flow = self.run(part, guard, stops, depth)
+            fails.append(all_of([done, flow.fails]))
+            for label, condition in flow.jumps.items():
+                jumps[label] = any_of([jumps.get(label, FALSE), all_of([hard, soft, condition])])
+            hard = all_of([hard, flow.falls])
+            if beside:
+                soft = all_of([soft, flow.settles])
+            else:
+                hard = all_of([hard, flow.settles])
+            done = done if isinstance(part, Check) else all_of([done, flow.settles])
+            falls = all_of([falls, flow.falls])
+        return _Flow(falls, all_of([hard, soft]), any_of(fails), jumps)
+
+
+def _inlined(node: Sequence | Block) -> list[Node]:
+    """Return the parts of a sequence, with those of sequences in it."""
+    parts = list[Node]()
+    for part in node.parts:
+        parts += _inlined(part) if type(part) is type(node) else [part]
+    return parts
