@@ -35,6 +35,7 @@ BENCHMARKS: dict[str, Callable[[Settings], list[Row]]] = {
     "reset": environment.reset,
     "construction": environment.construction,
     "queries": language.queries,
+    "branches": language.branches,
     "skills": language.skills,
     "samplers": sampling.samplers,
     "train_step": training.train_step,

@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 import lw_torchrl as lw
-from benchmarks.report import Row, Settings, Skipped, compare, take_turns
+from benchmarks.report import Row, Settings, Skipped, compare, take_turns, times_as_long
+from lw_torchrl.language.expressions import all_of, negate
+from lw_torchrl.language.queries import Query
 from lw_torchrl.transforms.qaf import plan_program
 
 BATCH = 4096
@@ -41,6 +44,27 @@ def queries(settings: Settings) -> list[Row]:
         _against(rival.eval_queries, "the plans of 10 tasks", plan_program(mt10), None, settings),
         _against(rival.eval_queries, "the plans of 50 tasks", plan_program(mt50), asked, settings),
     ]
+
+
+def branches(settings: Settings) -> list[Row]:
+    """The plans of 50 tasks as trees of branches, where each condition excludes those before it, against the plans."""
+    plans = lw.load_plans("MT50")
+    trees = lw.Plans([as_branches(plan) for plan in plans.values()])
+    _, states, task_id = _states(lw.MT50)
+    batch = TensorDict(observation=torch.from_numpy(states), task_id=task_id, batch_size=BATCH)
+    flat, nested = lw.QAFTransform(plans), lw.QAFTransform(trees)
+    contenders = {"trees": lambda: nested(batch), "flat": lambda: flat(batch)}
+    seconds = take_turns(contenders, settings.pick(200, 10), warm_up=5)
+    name = f"QAFTransform, plans of 50 tasks as trees, batch {BATCH}"
+    return [times_as_long(name, seconds["trees"], "the plans", seconds["flat"], unit="µs", scale=1e6, at_most=1.3)]
+
+
+def as_branches(plan: lw.ConditionalPlan) -> lw.ConditionalPlan:
+    """Return a plan whose conditions exclude the conditions of the steps before them, as "elif" does."""
+    conditions = [step.condition.expression for step in plan.steps]
+    guards = [all_of([*map(negate, conditions[:number]), each]) for number, each in enumerate(conditions)]
+    pairs = [(Query(guard), step.skill) for guard, step in zip(guards, plan.steps, strict=True)]
+    return lw.ConditionalPlan.from_pairs(plan.definition, pairs)
 
 
 def skills(settings: Settings) -> list[Row]:

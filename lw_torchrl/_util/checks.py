@@ -62,8 +62,8 @@ def typed(function: Function) -> Function:
     first invalid argument.
 
     NumPy scalars are converted to Python numbers. Annotations are evaluated at the first call, so all names in them
-    must be imported at run time: an argument whose type is imported only for type checkers is not checked here, as
-    ``plans``, which :func:`as_plans` checks. ``*args`` and ``**kwargs`` are not checked.
+    must be imported at run time: an argument whose type is imported only for type checkers is not checked here,
+    such as ``plans``, which :func:`as_plans` checks. ``*args`` and ``**kwargs`` are not checked.
     """
 
     def read_hints() -> dict[str, Any]:  # skip the return type, which may come from a package that is not installed
@@ -106,7 +106,8 @@ def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
 
 def check_value(argument: str, value: Any, hint: Any) -> Any:
     """Return ``value`` (NumPy scalars as Python numbers) if it matches a type hint; otherwise raise an
-    :class:`ArgumentError`."""
+    :class:`ArgumentError`.
+    """
     if not checker(hint)(value):
         choices = [
             choice for part in (hint, *get_args(hint)) if get_origin(part) is Literal for choice in get_args(part)
@@ -123,7 +124,8 @@ def _plain(value: Any) -> Any:
 @cache
 def checker(hint: Any) -> Callable[[Any], bool]:
     """Return a function that checks whether a value matches a type hint. Containers are checked item by item, because
-    beartype checks only one random item, which misses wrong items and advances Python's random generator."""
+    beartype checks only one random item, which misses wrong items and advances Python's random generator.
+    """
     kind, parts = get_origin(hint), get_args(hint)
     if kind in (Union, UnionType):
         alternatives = [checker(part) for part in parts]
@@ -162,7 +164,8 @@ def _words(hint: Any) -> str:
 
 def check_choice(argument: str, value: Any, allowed: Iterable[str]) -> Any:
     """Return ``value`` if it is in ``allowed``; otherwise raise a :class:`ValueError` that suggests the closest allowed
-    names."""
+    names.
+    """
     names = list(allowed)
     if value not in names:
         raise unknown_name(argument, value, names)

@@ -159,7 +159,7 @@ class Check:
         if not file.exists() and (":" in self.source or self.source in lw.suites.SUITES):
             return _check_suite(output, self.source)
         if not file.exists():
-            raise FileNotFoundError(f"no file, folder or suite {self.source!r}")
+            raise FileNotFoundError(f"no such file, folder or suite: {self.source!r}")
         if file.suffix == ".toml":
             return _check_toml(output, file, options.read_tasks(self.task_file))
         files = sorted(file.glob("*.plan")) if file.is_dir() else [file]

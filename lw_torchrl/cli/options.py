@@ -194,7 +194,9 @@ def read_encoder(name: str | None) -> TextEncoder | None:
 
 
 def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> lw.QueryEvaluator:
-    """Return an evaluator for ``plans``: from a file, from "my_module:evaluator", or new, of a registered class."""
+    """Return an evaluator for ``plans``: loaded from a file, imported from "my_module:evaluator", or newly
+    created from a registered class.
+    """
     encoder = read_encoder(text_encoder)
     if Path(name).exists() or not (":" in name or name == "StateQueryEvaluator"):
         return lw.training.load_evaluator(name, plans, text_encoder=encoder)

@@ -251,7 +251,7 @@ class Read:
         task, format = self.task or re.sub(r"-\d+$", "", file.stem), self.format or file.absolute().parent.name
         known = options.read_tasks(self.task_file, (task,) if self.task else ())
         if task not in known and self.task is None:
-            raise ValueError(f"--task is required: the file name {file.name!r} does not contain a task, got {task!r}")
+            raise ValueError(f"--task is required, because the file name {file.name!r} does not name a task")
         if format not in PLAN_FORMATS and self.format is None:
             known_formats = ", ".join(PLAN_FORMATS)
             raise ValueError(f"--format is required (one of {known_formats}): folder {format!r} is not a format")

@@ -263,7 +263,7 @@ def collect_demonstrations(
     exists, the call only verifies its checksums. The dataset depends neither on ``num_envs`` nor on interruptions.
 
     Each row is one time step, in TorchRL's TED layout (R rows):
-        observation, next/observation: (R, 39) float32, meters.
+        observation, next/observation: (R, 39) float32, metres.
         task_id, next/task_id, episode: (R,) int64. collector/traj_ids: (R,) int64, unique per episode.
         action: (R, 4) float32 in [-1, 1], the executed action, including noise.
         expert_action: (R, 4) float32 in [-1, 1], the policy's action in the same state without noise;
@@ -285,8 +285,8 @@ def collect_demonstrations(
             modules and functions.
         seed: random seed (use a different one for evaluation).
         noise_scale: standard deviation of the noise on the executed action; a sequence is cycled over the episodes.
-        noise_hold: number of time steps for which each noise value is held; larger values lead further off the
-            expert's path.
+        noise_hold: number of time steps for which each noise value is held; larger values lead further away from
+            the expert's path.
         gripper_noise_factor: factor on the noise of the gripper.
         redraw_failures: keep only successful episodes, and replace failed ones.
         max_steps: number of time steps per episode; None for the suite's default.

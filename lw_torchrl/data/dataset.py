@@ -190,7 +190,10 @@ def damaged(problem: str) -> DatasetError:
 
 
 def parse_metadata(metadata: Mapping[str, Any], folder: Path) -> Demonstrations:
-    """Parse a dataset's metadata; raise DatasetError for another version, and any error for corrupted metadata."""
+    """Parse a dataset's metadata.
+
+    Raise DatasetError if the version differs; corrupted metadata may raise any exception.
+    """
     if (metadata["format"], metadata["version"]) != (FORMAT, FORMAT_VERSION):
         version = f"{short(metadata['format'])} version {short(metadata['version'])}"
         raise DatasetError(

@@ -102,7 +102,7 @@ class GroupSampler(Sampler):
         """Return an integer weight (at least 1) for each of G groups, and an explanation for error messages."""
 
     def _keys(self, storage: Storage, rows: Tensor) -> Tensor | None:
-        """Return the key (n,) int64 of the group of each given row; None if grouping requires all rows."""
+        """Return the group key of each given row, (n,) int64; None if grouping requires all rows."""
         return None
 
     def _covered(self, storage: Storage) -> int:

@@ -30,14 +30,15 @@ from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 
 class LanguageWorldEnv(EnvBase):
-    """A batch of N environments with any mixture of the 50 tasks, by the MT50-rand protocol: each reset draws a random
-    initial state and goal, the goal is observed, and episodes are truncated after 500 time steps.
+    """A batch of N environments with any mixture of the 50 tasks, following the MT50-rand protocol: each reset draws a
+    random initial state and goal, the goal is observed, and episodes are truncated after 500 time steps.
 
     Row i has the task ``tasks[i % n]``. If R rows have the same task, the m-th reset of the r-th of these rows starts
     episode m·R + r of the task; in worker w of W, episode (m·W + w)·R + r. An episode's initial state is that of
     Meta-World after ``env.seed(episode_seed(task, seed, episode)); env.reset()``, independent of earlier episodes.
-    ``env.reset(episode=7)``, or an int64 tensor (N,), starts these episodes and counts as a reset; with a SerialEnv or
-    ParallelEnv, use ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores ``episode`` in a tensordict.
+    ``env.reset(episode=7)`` starts episode 7 in every row; an int64 tensor (N,) selects one episode per row. Both count
+    as a reset. With a SerialEnv or ParallelEnv, use ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores
+    ``episode`` in a tensordict.
 
     Give each worker of a SerialEnv, ParallelEnv, AsyncEnvPool or multi-process collector a distinct ``worker=(w, W)``,
     as in ``ParallelEnv(2, [partial(make_env, worker=(w, 2)) for w in range(2)])``; otherwise all workers run the same
@@ -80,7 +81,7 @@ class LanguageWorldEnv(EnvBase):
         terminate_on_success: end an episode at its first success, and set ``terminated``.
         strict: raise an error on a NaN action, instead of truncating the row with a warning.
         worker: (w, W), this environment's index among W environments; None for a single environment.
-        batch_size: () for a single environment without a batch dimension, for AsyncEnvPool.
+        batch_size: () for a single environment without a batch dimension, as needed for AsyncEnvPool.
         device: device of the tensors that reset and step return; "auto" for this machine's accelerator.
 
     Raises:

@@ -29,7 +29,8 @@ def _with_ids(method: Callable[..., Any], change: Callable[..., Tensor] = lambda
 
 class TaskIds(Categorical):
     """The spec of ``task_id``, whose zero is each row's own task id, (N,) int64. TorchRL calls policies on the zeros of
-    ``fake_tensordict()``, and a policy may not know the task with id 0."""
+    ``fake_tensordict()``, and a policy may not know the task with id 0.
+    """
 
     ids: Tensor | None = None
 
@@ -82,7 +83,7 @@ def _flag(n: int) -> Categorical:
 
 
 def clipped_action(tensordict: TensorDictBase, shape: tuple[int, ...]) -> Tensor:
-    """Return the action, clipped to [-1, 1]; raise unless the action is float32 of this shape."""
+    """Return the action, clipped to [-1, 1]; raise an error unless it is float32 of the expected shape."""
     action = tensordict.get("action", None)
     if action is None or action.shape != shape or action.dtype != torch.float32:
         got = "no action" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
@@ -96,7 +97,8 @@ Rows = NDArray[np.intp]
 class RowStates:
     """The state of N rows: the last observation (N, D) float32; the episode (-1 before the first reset) and the time
     steps since the reset, (N,) int64; and the flags over (true before the first reset), terminated, fault and success,
-    (N,) bool."""
+    (N,) bool.
+    """
 
     def __init__(self, tasks: Sequence[str], layout: Layout) -> None:
         self.tasks, self.layout = tasks, layout
@@ -117,7 +119,8 @@ class RowStates:
 
     def as_tensordict(self, executed_action: NDArray[np.float32] | None = None, **more: Tensor) -> TensorDict:
         """Return a copy of the state as a TensorDict (N,), with ``executed_action`` (N, A) float32 (None for zeros) and
-        the additional entries ``more``."""
+        the additional entries ``more``.
+        """
         n = len(self.tasks)
         over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
         if executed_action is None:

@@ -9,9 +9,11 @@ from lw_torchrl.language.expressions import Expression, all_of, any_of, negate
 
 CONNECTIVES = ("and", "or", "nor", "unless", "either", "neither", "both")
 """The words that join conditions, which no name of an object or a relation may contain."""
+OPENERS = ("(", "either", "both", "neither")
+"""The words that open a group of conditions."""
 
 
-@dataclass
+@dataclass(slots=True)
 class _Group:
     """The operands that a parser has read since a parenthesis, "either", "both" or "neither"."""
 
@@ -65,7 +67,7 @@ def parse_words(
     stack, pending, negated, expects = [_Group("", False)], list[str](), False, True
     for number, given in enumerate((*words, "")):
         word = given.casefold()
-        opens = word in ("(", "either", "both", "neither")
+        opens = word in OPENERS
         if not expects and (opens or word not in ("", ")", *CONNECTIVES)):
             raise fail(number, "'and', 'or' or the end of the condition")
         if opens:

@@ -119,15 +119,15 @@ def all_of(parts: Iterable[Any]) -> Expression:
     """
     distinct: dict[Expression, None] = {}
     for part in map(as_expression, parts):
-        if part.kind == "all":
+        if part.node.parts is not None and not part.negated:
             distinct.update(dict.fromkeys(part.parts))
         else:
             distinct[part] = None
         if len(distinct) > MOST_PARTS:
             raise ValueError(f"a condition must join at most {MOST_PARTS} others by 'and' or 'or'; split the condition")
-    either = [part for part in distinct if part.kind == "any"]
-    if any(negate(part) in distinct for part in distinct):
-        return FALSE
+    either = [part for part in distinct if part.node.parts is not None]
+    if len({part.node for part in distinct}) < len(distinct):
+        return FALSE  # an expression and its negation have the same node
     if any(all(other in distinct for other in part.node.parts or ()) for part in either):
         return FALSE  # "a and b and not (a and b)"
     if either:

@@ -82,7 +82,7 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
         by: "edit" compares spelling; "embedding" compares meaning and needs the extra ``[text]``.
 
     Raises:
-        QueryError: the text has more than 256 parts.
+        QueryError: the text has more than 256 parts or parentheses.
         ImportError: the extra ``[text]`` is not installed.
 
     Example:

@@ -53,8 +53,8 @@ class NamedObject:
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9'-]*( [a-z0-9][a-z0-9'-]*)*", self.name):
             raise ValueError(f"name must be lower-case words like 'drawer handle', got {shown(self.name)}")
-        if {*CONNECTIVES, "is", "not", "the"} & set(self.name.split()):
-            raise ValueError(f"name must not contain 'and', 'is', 'not' or 'the', got {shown(self.name)}")
+        if reserved := [word for word in self.name.split() if word in (*CONNECTIVES, "is", "not", "the")]:
+            raise ValueError(f"name must not contain {reserved[0]!r}, which is reserved in queries, got {self.name!r}")
         if self.opening is not None and (self.ours or self.name == GRIPPER):
             raise ValueError(f"opening of {self.name!r} must be None: points have none, the gripper's is in the layout")
 

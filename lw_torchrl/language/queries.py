@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -11,12 +12,13 @@ from itertools import permutations
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._util.checks import typed
-from lw_torchrl.language.connectives import CONNECTIVES, parse_words
+from lw_torchrl.language.connectives import CONNECTIVES, OPENERS, parse_words
 from lw_torchrl.language.expressions import (
     FALSE,
     TRUE,
     Expression,
     all_of,
+    as_expression,
     count_mentions,
     implied,
     leaves,
@@ -74,8 +76,8 @@ class Query:
     def __init__(self, expression: Expression | tuple[Clause, ...]) -> None:
         if not isinstance(expression, Expression):
             object.__setattr__(self, "_given", tuple(expression))
-            expression = all_of(expression)
-        if any(clause.negated for clause in leaves(expression)):
+            expression = all_of(map(_without_negation, expression))
+        elif any(clause.negated for clause in leaves(expression)):
             expression = replace_leaves(expression, _without_negation)
         object.__setattr__(self, "expression", expression)
 
@@ -87,8 +89,9 @@ class Query:
     @property
     def is_conjunction(self) -> bool:
         """True for a clause or a conjunction of clauses: a query without "or"."""
-        parts = self.expression.parts
-        return bool(self._given) or (self.expression.kind != "any" and all(part.kind == "leaf" for part in parts))
+        if self._given:
+            return True
+        return self.expression.kind != "any" and all(part.kind == "leaf" for part in self.expression.parts)
 
     @cached_property
     def clauses(self) -> tuple[Clause, ...]:
@@ -98,12 +101,11 @@ class Query:
     @cached_property
     def implied(self) -> tuple[Clause, ...]:
         """The clauses that are true wherever the query is true, as far as its form shows."""
-        return tuple(map(_as_clause, implied(self.expression)))
+        return self._given or tuple(map(_as_clause, implied(self.expression)))
 
 
 def _without_negation(clause: Clause) -> Expression:
-    positive = all_of([replace(clause, negated=False)])
-    return negate(positive) if clause.negated else positive
+    return negate(replace(clause, negated=False)) if clause.negated else as_expression(clause)
 
 
 def _as_clause(literal: Expression) -> Clause:
@@ -119,12 +121,15 @@ def split_words(text: str) -> list[str]:
     puck)".
 
     Raises:
-        QueryError: the text has more clauses than a query may have.
+        QueryError: the text has more clauses or groups than a query may have.
     """
     words = re.findall(r"[()]|[^\s()]+", text)
-    clauses = 1 + sum(word.casefold() in ("and", "or", "nor", "unless") for word in words)
-    if clauses > MOST_CLAUSES:
-        raise QueryError(f"query {_cut(text)!r} must have at most {MOST_CLAUSES} clauses, got {clauses}")
+    joins = Counter(map(str.casefold, words))
+    clauses = 1 + sum(joins[word] for word in ("and", "or", "nor", "unless"))
+    groups = sum(joins[word] for word in OPENERS)
+    for number, counted in ((clauses, "clauses"), (groups, "parentheses")):
+        if number > MOST_CLAUSES:
+            raise QueryError(f"query {_cut(text)!r} must have at most {MOST_CLAUSES} {counted}, got {number}")
     spaced, pattern = " ".join(words), _two_relations(tuple(RELATIONS))
     if pattern.search(spaced) is None:
         return words
@@ -248,7 +253,7 @@ class _ClauseParser:
         if predicate in STATES and subject not in self.task.openings:
             self.at -= len(predicate.split())
             openable = " and ".join(f"the {name}" for name in self.task.openings).replace(GRIPPER, "gripper")
-            raise self.error(f"a predicate of the {subject}; only {openable} can be {' or '.join(STATES)}")
+            raise self.error(f"a predicate that fits the {subject} (only {openable} can be {' or '.join(STATES)})")
         start, other = self.at, None if predicate in UNARY else self.name()
         if other is None and predicate not in UNARY:
             raise self.name_error()
@@ -320,7 +325,8 @@ def check_query(query: str | Query, task: str | Task) -> Query:
     if not isinstance(query, Query):
         return parse_query(query, task)
     owner = get_task(task)
-    if (clauses := max(len(query.clauses), count_mentions(query.expression))) > MOST_CLAUSES:
+    clauses = len(query.clauses) if query.is_conjunction else count_mentions(query.expression)
+    if clauses > MOST_CLAUSES:
         raise QueryError(f"a query must have at most {MOST_CLAUSES} clauses when it is written, got {clauses}")
     if all(_is_of(clause, owner) for clause in query.clauses):
         return query

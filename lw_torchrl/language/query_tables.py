@@ -22,7 +22,8 @@ from lw_torchrl.language.tasks import MT50, Task, one_layout, task_id
 class Atom(NamedTuple):
     """A comparison of two positions in the form "value < threshold".
 
-    For the senses ">" and "<=" the positions are swapped, which negates the value, and the threshold is negated too.
+    For the operators ">" and "<=", the positions are swapped, which negates the value; the threshold is also
+    negated.
     """
 
     first: TypedPosition
@@ -171,7 +172,7 @@ Condition = tuple[int, int]  # (care, want)
 
 
 def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], dict[Condition, int], list[Condition]]:
-    """Return the bit number of each atom, the bit of each gate, and each query's (care, want) bits."""
+    """Return each atom's bit number, each gate's bit, and each query's (care, want) bit masks."""
     expressions = [query.expression for query in queries]
     places: dict[Atom, int] = {}
     bits: dict[Clause, int] = {}

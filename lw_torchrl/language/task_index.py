@@ -126,14 +126,16 @@ class PlanTables:
             self.number = numbers
         if asserted(number, rows):
             own = numbers[rows]
-            torch._assert_async(((own == number) | (number == 0)).all(), "qaf belongs to plans other than the actor's")
+            torch._assert_async(
+                ((own == number) | (number == 0)).all(), "qaf was computed with plans other than the actor's"
+            )
         if not readable(number, rows):
             return
         own = numbers[rows]
         if not torch.equal(own, number) and (wrong := (own != number) & (number != 0)).any():
             tasks = ", ".join(self.index.tasks[row] for row in rows[wrong].unique().tolist()[:5])
             hint = "pass the actor's plans to the transform: QAFTransform(actor.plans)"
-            raise ValueError(f"qaf belongs to plans other than the actor's, for {tasks}; {hint}")
+            raise ValueError(f"qaf was computed with plans that differ from the actor's plans for {tasks}; {hint}")
 
 
 def answers_of(qaf: Tensor, task_id: Tensor, number: Tensor | None, tables: PlanTables) -> tuple[Tensor, Tensor]:

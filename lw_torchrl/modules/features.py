@@ -148,7 +148,7 @@ class ObservationFeatures(Features):
 
     @torch.no_grad()
     def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
-        """Compute mean and standard deviation of the rows; a nearly constant feature is not rescaled."""
+        """Compute the mean and standard deviation of the rows; a nearly constant feature is not rescaled."""
         (observation,) = read(rows, self.in_keys)
         features = self._select(observation.reshape(-1, self.layout.size))
         check_rows(features)

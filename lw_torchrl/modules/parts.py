@@ -55,7 +55,10 @@ def materialize(module: nn.Module, *inputs: Tensor) -> None:
 
 @torch.no_grad()
 def probe(module: nn.Module, example: Tensor) -> Any:
-    """Return a module's output for an example (moved to the module's device); keep the global random state."""
+    """Return a module's output for an example, which is moved to the module's device.
+
+    The global random state is left unchanged.
+    """
     weight = next(module.parameters(), None)
     with evaluating(module), torch.random.fork_rng(devices=[]):
         return module(example if weight is None else example.to(weight.device))

@@ -154,11 +154,11 @@ class FocusFeatures(_RelativePositions):
 
 
 class RoleFeatures(_RelativePositions):
-    """Features of the active plan step: the target's position relative to the moved object, and the direction.
+    """Features of the active plan step: the target's position relative to the moved object, and the motion direction.
 
     "lower the gripper around the puck" and "... the mug" are the same motion in these features, so policies can
     transfer it between tasks. The direction of "push the dial to the right" is to the right; that of "push it toward
-    the target location" is from the object to the goal. Positions longer than 25 cm are shortened to 25 cm.
+    the target location" is from the object to the goal. Offsets longer than 25 cm are shortened to 25 cm.
 
     If the gripper touches an object away from the object's position, the target is the *contact*, which :meth:`fit`
     computes from demonstrations of the task. In a task without demonstrations, the target is the point that the plan

@@ -94,7 +94,7 @@ class ScriptedSkillActor(Part):
         return key
 
     def with_plans(self, plans: AnyPlans) -> ScriptedSkillActor:
-        """Return an actor that follows different plans with the same skills."""
+        """Return an actor that has the same skills but follows other plans."""
         options = {**super().config, "plans": plans, "skills": self._skills}
         return in_mode_of(self, ScriptedSkillActor(**options))
 

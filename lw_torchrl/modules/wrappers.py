@@ -141,7 +141,7 @@ class DecidedGripper(_ActionWrapper):
         return {"actor": self.actor, "closes_above": self.closes_above, "layout": self.action_layout}
 
     def converted(self, action: Tensor) -> Tensor:
-        """Return actions with a gripper effort of -1 or 1, or the same actions during training."""
+        """Return the actions with a gripper effort of -1 or 1; during training, return them unchanged."""
         return action if self.training else decided(action, self.action_layout, self.closes_above)
 
     def with_plans(self, plans: AnyPlans) -> DecidedGripper:

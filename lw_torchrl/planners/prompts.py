@@ -107,9 +107,9 @@ class Question(NamedTuple):
 def chat_messages(
     task: Task, format: str, plans: AnyPlans | None, vocabulary: bool, constrain: bool
 ) -> list[dict[str, str]]:
-    """Build the system message, which requests only the plan, and the user's message with the prompt.
+    """Build the system message, which asks for the plan only, and the user message, which holds the prompt.
 
-    For a constrained model, the system message also shows the last example as JSON.
+    If the model's output is constrained, the system message also shows the last example as JSON.
     """
     how = (
         "the whole of it, in the form of the plans that you are shown: no other tasks, and nothing before or after it."
@@ -150,7 +150,7 @@ def write_structured(plan: ConditionalPlan, style: Style) -> str:
 
 def _write_query(query: Query) -> list[dict[str, str]] | str:
     """Convert a query to JSON: one object per clause of a conjunction, or a sentence for any other query."""
-    if not query.is_conjunction:
+    if not query.is_conjunction or not query.clauses:
         return str(query)
     rows = []
     for clause in query.clauses:

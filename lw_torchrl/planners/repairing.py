@@ -72,7 +72,7 @@ def _written(text: str, distance: float) -> str:
     return f"   <- {text!r} ({distance:.2f})" if distance else ""
 
 
-def check_plan(
+def try_plan(
     text: str,
     task: str | Task,
     format: str,
@@ -88,7 +88,7 @@ def check_plan(
 
     Example:
         >>> import lw_torchrl as lw
-        >>> check = check_plan(lw.encode_plan(lw.load_plans("MT10")["reach"], "basic_md"), "reach", "basic_md")
+        >>> check = try_plan(lw.encode_plan(lw.load_plans("MT10")["reach"], "basic_md"), "reach", "basic_md")
         >>> check.never, check.expert.covered, check.success
         ((), 1.0, 1.0)
     """
@@ -137,7 +137,7 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
-        >>> print(plan_facts(check_plan("I cannot.", "reach", "basic_py"), TASKS["reach"]))
+        >>> print(plan_facts(try_plan("I cannot.", "reach", "basic_py"), TASKS["reach"]))
         The answer was read, and no plan was found in it: the text has no steps for reach or any other task.
         In the answer, line 1: the text is not part of a plan: 'I cannot.'
         Write the plan for `reach` again, the whole of it, in the same form, with this corrected.

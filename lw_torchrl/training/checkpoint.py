@@ -104,11 +104,11 @@ def load_evaluator(
     text_encoder: TextEncoder | None = None,
     parts: Sequence[type[nn.Module]] = (),
 ) -> QueryEvaluator:
-    """Load an evaluator in eval mode, to answer the conditions of any plans.
+    """Load an evaluator in eval mode, for the conditions of any plans.
 
     Args:
-        path, text_encoder, parts: see :func:`load_actor`, also for the errors.
-        plans: the plans; :class:`ValueError` if the evaluator cannot answer a plan's conditions.
+        path, text_encoder, parts: see :func:`load_actor`, which also lists the errors.
+        plans: the plans; raises :class:`ValueError` if the evaluator cannot evaluate a plan's conditions.
     """
     answered = [as_plans(plans).to_json()]
     evaluator: QueryEvaluator = _load(
@@ -298,7 +298,7 @@ class CheckpointFiles:
     def write(
         self, description: Mapping[str, Any], device: torch.device, tensors: Any, state: Any, part: nn.Module | None
     ) -> None:
-        """Write the training state (``tensors`` and ``state``), then the policy or evaluator ``part``, atomically."""
+        """Atomically write the training state (``tensors``, ``state``), then the policy or evaluator (``part``)."""
         _write(self.state, "training", {**description, "device": device.type}, tensors, state)
         self._known = self._version()
         if self.part is not None and part is not None:

@@ -62,7 +62,7 @@ def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int
 
 
 def _check_loss(losses: Tensor, step: int, config: Any) -> None:
-    """Raise :class:`ValueError` if a loss of one actor () or of M actors (M,) is not finite."""
+    """Raise :class:`ValueError` if a loss, () for one actor or (M,) for M actors, is not finite."""
     if losses.isfinite().all():
         return
     number = int((~losses.reshape(-1).isfinite()).nonzero()[0])

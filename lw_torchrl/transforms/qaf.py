@@ -218,7 +218,7 @@ class CorruptQAF(EpisodeTransform):
         shape = (*self._plan.shape, self.plans.num_steps)
         if truth.shape != shape or not (truth.dtype == torch.bool or truth.is_floating_point()):
             got = f"{truth.dtype} of shape {tuple(truth.shape)}"
-            raise ValueError(f"qaf must be bool, or float for soft truth, of shape {shape}, got {got}")
+            raise ValueError(f"qaf must be bool (or float, for soft truth values) of shape {shape}, got {got}")
         self._steps = reset_rows(self._steps, torch.zeros_like(self._plan), begun)
         self._answers = reset_rows(self._answers, torch.stack([truth] * self._places, -2), begun, 2)
         return self._show(tensordict_reset)

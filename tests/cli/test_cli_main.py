@@ -74,7 +74,7 @@ print([name for name in ("torch", "torchrl", "mujoco", "rich") if name in sys.mo
         (["train-evaluator", "reach", "--out", "OUT", "--held-out-pairs", "2"], "--held-out-pairs must be from 0 to 1"),
         (["train", "nowhere", "--out", "OUT"], "nowhere"),
         (["view", "nowhere.rrd"], "nowhere.rrd"),
-        (["check", "nowhere.plan"], "no file, folder or suite 'nowhere.plan'"),
+        (["check", "nowhere.plan"], "no such file, folder or suite: 'nowhere.plan'"),
     ],
 )
 def test_an_error_is_one_line_and_status_2(capsys, tmp_path, monkeypatch, args, message):

@@ -297,7 +297,7 @@ def make_state(rows=3):
     [
         ("observation", float("nan"), "observation must hold finite numbers"),
         ("task_id", -1, "task_id contains tasks without a plan"),
-        ("qaf_plan", 5, "qaf belongs to plans"),
+        ("qaf_plan", 5, "qaf was computed with plans"),
         ("qaf", 2.0, "qaf must be bool, or numbers from 0 to 1"),
     ],
 )

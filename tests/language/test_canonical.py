@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
+from benchmarks.language import as_branches
 from lw_torchrl.language import canonical, roles, step_parser
 from lw_torchrl.language.canonical import (
     MIN_CONFIDENCE,
@@ -16,11 +17,9 @@ from lw_torchrl.language.canonical import (
     explain_canonical,
     fallback_plan,
 )
-from lw_torchrl.language.expressions import all_of, negate
 from lw_torchrl.language.objects import GOAL, GRIPPER, NamedObject
 from lw_torchrl.language.plan_files import parse_plan
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
-from lw_torchrl.language.queries import Query
 from lw_torchrl.language.roles import StepRole, mark_objects, role_vectors
 from lw_torchrl.language.step_parser import parse_steps
 from lw_torchrl.language.tasks import first_object, role_object
@@ -213,21 +212,13 @@ def test_the_order_of_clauses_does_not_matter(random, task):
     assert [step.skill for step in report.plan.steps] == [step.skill for step in other.plan.steps]
 
 
-def as_tree(plan):
-    """Return a plan whose conditions exclude the conditions of the steps before, as "elif" does."""
-    conditions = [step.condition.expression for step in plan.steps]
-    guards = [all_of([*map(negate, conditions[:number]), each]) for number, each in enumerate(conditions)]
-    pairs = [(Query(guard), step.skill) for guard, step in zip(guards, plan.steps, strict=True)]
-    return lw.ConditionalPlan.from_pairs(plan.definition, pairs)
-
-
 @pytest.mark.parametrize("task", list(OWN))
 def test_a_tree_of_branches_has_the_canonical_form_of_the_flat_plan(task):
     plan = OWN[task]
-    flat, tree = explain_canonical(plan), explain_canonical(as_tree(plan))
+    flat, tree = explain_canonical(plan), explain_canonical(as_branches(plan))
     assert (tree.source, tree.plan.confidence) == (flat.source, flat.plan.confidence)
     assert [step.role for step in tree.plan.steps] == [step.role for step in flat.plan.steps]
-    assert lw.ConditionalPlan.from_json(task, as_tree(plan).to_json()) == as_tree(plan)
+    assert lw.ConditionalPlan.from_json(task, as_branches(plan).to_json()) == as_branches(plan)
 
 
 def test_the_longest_name_is_marked():

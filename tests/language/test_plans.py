@@ -72,7 +72,7 @@ def test_reasons_do_not_count_for_equality():
         ("psuh", plan().steps, ValueError, "'push'"),
         ("push", (PlanStep(OPEN, "push"), None), TypeError, "step"),
         ("push", (PlanStep(DRAWER_NEAR, "x"),), PlanError, "step 1"),
-        ("push", (PlanStep(OPEN, "push"), PlanStep(Query(()), "push")), PlanError, "step 2"),
+        ("push", (PlanStep(OPEN, "push"), PlanStep(Query((Clause("puck", "open"),)), "push")), PlanError, "step 2"),
         (
             "push",
             (PlanStep(OPEN, "x", goal=parse_query("gripper near drawer handle", "drawer-open")),),

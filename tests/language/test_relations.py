@@ -207,6 +207,7 @@ def test_a_custom_relation_is_listed_parsed_and_matched_until_it_is_removed():
         (3, OWN["beside"], "lower-case words"),
         ("open", OWN["beside"], "reserved in queries"),
         ("not near", OWN["beside"], "reserved in queries"),
+        ("near or at", OWN["beside"], "reserved in queries"),
         ("near and dear to", OWN["beside"], "'and'"),
         ("beside", (), "at least one"),
         ("beside", OWN["beside"][0], "at least one Comparison"),

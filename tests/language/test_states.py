@@ -91,7 +91,7 @@ def test_a_custom_state_is_a_predicate_of_objects_with_an_opening(monkeypatch):
         state, "the door is ajar", "the door is not ajar", "the door is on and the light switch is not on"
     )
     assert truth.T.tolist() == [[False, True, True, False], [True, False, False, True], [False, False, False, True]]
-    with pytest.raises(QueryError, match="of the cup; only the gripper and the door and the light switch can be"):
+    with pytest.raises(QueryError, match=r"the cup .only the gripper and the door and the light switch can be"):
         parse_query("the cup is on", HOUSE)
     with pytest.raises(QueryError, match="only the gripper can be open or closed or on or ajar"):
         parse_query("the puck is ajar", "push")

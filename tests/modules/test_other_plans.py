@@ -17,7 +17,7 @@ STEPS = [
     ("the gripper is not above the puck", "place the gripper above the puck"),
     ("the gripper is above the puck", "lower the gripper around the puck"),
 ]
-REFUSED = "qaf belongs to plans.* push"
+REFUSED = "qaf was computed with plans.* push"
 
 
 def plans_of(pairs, *more):
@@ -140,7 +140,7 @@ def test_compiled_actor_refuses_at_run_time():
     actor = lw.PlanConditionedActor(PLANS).eval()
     act = torch.compile(lambda data: actor(data)["action"], backend="eager")
     assert act(state(PLANS)).shape == (3, 4)
-    with pytest.raises(RuntimeError, match="qaf belongs to plans"):
+    with pytest.raises(RuntimeError, match="qaf was computed with plans"):
         act(state(OTHERS["another skill"]))
     wrong = state(PLANS)
     wrong["observation"][1, 2] = torch.nan

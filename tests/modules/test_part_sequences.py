@@ -58,7 +58,7 @@ def test_parts_with_different_plans_are_refused():
     with pytest.raises(ValueError, match="attention and mixer"):
         actor.mixer = SkillMixer(REVERSED)
     policy = TensorDictSequential(lw.modules.StateQueryEvaluator(REVERSED), lw.PlanConditionedActor(PLANS))
-    with pytest.raises(ValueError, match="qaf belongs to plans"):
+    with pytest.raises(ValueError, match="qaf was computed with plans"):
         policy(observation=torch.zeros(2, 39), task_id=IDS)
 
 

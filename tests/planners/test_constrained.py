@@ -242,6 +242,7 @@ def test_a_server_that_ignores_the_schema(ask, tmp_path):
 
 def test_a_condition_with_or_is_a_sentence():
     pairs = [("gripper open or near puck", "grasp the puck"), ("not (gripper open or near puck)", "lift the puck")]
+    pairs.append(("always", "push the puck"))
     plan = lw.ConditionalPlan.from_pairs("push", pairs)
     text = write_structured(plan, PLAN_FORMATS["basic_py"].style)
     assert '"condition": "the robot' in text

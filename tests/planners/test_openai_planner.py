@@ -12,7 +12,7 @@ from fake_server import PLANS, Failure, FakeServer, asked_for, completion, error
 
 import lw_torchrl as lw
 from lw_torchrl.planners import PlannerError, Tokens
-from lw_torchrl.planners.openai_planner import REPLY_LIMIT
+from lw_torchrl.planners.chat_client import REPLY_LIMIT
 
 KEY = "sk-a-secret-of-the-tests"
 

@@ -1,4 +1,4 @@
-"""check_plan and repair_plans: a plan runs in the simulator, and its model reads how it fared."""
+"""try_plan and repair_plans: a plan runs in the simulator, and its model reads how it fared."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from fake_server import PLANS, FakeServer, asked_for, completion, serving
 import lw_torchrl as lw
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.planners.prompts import write_structured
-from lw_torchrl.planners.repairing import check_plan, plan_facts, repair_plans
+from lw_torchrl.planners.repairing import plan_facts, repair_plans, try_plan
 
 NEVER = "the robot's gripper is open and the robot's gripper is closed"
 ANSWER = """def reach(robot):
@@ -34,12 +34,12 @@ def planner(tmp_path):
     return make
 
 
-# ---- check_plan
+# ---- try_plan
 
 
 def test_a_step_that_never_fires_is_named():
     plan = plan_with("push", lambda pairs: [pairs[0], (NEVER, pairs[0][1]), *pairs[1:]])
-    check = check_plan(lw.encode_plan(plan, "basic_py"), "push", "basic_py", episodes=2)
+    check = try_plan(lw.encode_plan(plan, "basic_py"), "push", "basic_py", episodes=2)
     assert check.never == (1,)
     assert check.expert.true[1] == check.own.true[1] == 0.0
     assert check.success == 1.0
@@ -49,22 +49,22 @@ def test_a_step_that_never_fires_is_named():
 
 def test_states_where_no_condition_holds_are_named():
     plan = lw.ConditionalPlan("push", PLANS["push"].steps[:2])
-    check = check_plan(lw.encode_plan(plan, "basic_py"), "push", "basic_py", episodes=2)
+    check = try_plan(lw.encode_plan(plan, "basic_py"), "push", "basic_py", episodes=2)
     episode, first, last = max(check.expert.gaps, key=lambda gap: gap[2] - gap[1])
     assert 0 < first < last
     assert f"No condition holds in steps {first} to {last} of the expert's episode {episode}." in str(check)
 
 
 def test_mapped_and_dropped_steps_are_printed():
-    printed = str(check_plan(ANSWER, "reach", "basic_py", episodes=1))
+    printed = str(try_plan(ANSWER, "reach", "basic_py", episodes=1))
     assert "hold the gripper at the reach target   <- '" in printed
     assert "the moon is full" in printed
-    assert str(check_plan("I cannot.", "reach", "chain_md")).startswith("reach: no plan: ")
+    assert str(try_plan("I cannot.", "reach", "chain_md")).startswith("reach: no plan: ")
 
 
 def test_the_facts_describe_a_failure():
     plan = plan_with("push", lambda pairs: [pairs[0], (NEVER, pairs[1][1]), *pairs[2:]])
-    facts = plan_facts(check_plan(lw.encode_plan(plan, "basic_py"), "push", "basic_py", episodes=2), lw.TASKS["push"])
+    facts = plan_facts(try_plan(lw.encode_plan(plan, "basic_py"), "push", "basic_py", episodes=2), lw.TASKS["push"])
     assert f"step 2, '{NEVER}', held at no time" in facts
     assert "of 2 failed episodes" in facts
     assert "The robot's gripper came within " in facts

@@ -242,7 +242,7 @@ def test_missing_keys_other_plans_and_unknown_tasks_are_refused(name):
     transform = MAKERS[name]()
     with pytest.raises(ValueError, match="qaf"):
         transform(rows().exclude("qaf"))
-    with pytest.raises(ValueError, match="qaf belongs to plans"):
+    with pytest.raises(ValueError, match="qaf was computed with plans"):
         transform(lw.QAFTransform(MT10)(rows(plans=MT10)))
     with pytest.raises(ValueError, match="task_id"):
         transform(rows(plans=CANONICAL, task="soccer"))

@@ -262,7 +262,7 @@ def test_missing_qaf_is_refused():
 def test_answers_of_other_plans_are_refused():
     turned = lw.Plans([lw.ConditionalPlan("reach", PLANS["reach"].steps[::-1]), PLANS["push"]])
     env = TransformedEnv(RandomStates(2), Compose(lw.QAFTransform(turned), lw.transforms.CorruptQAF(PLANS)))
-    with pytest.raises(ValueError, match="qaf belongs to plans"):
+    with pytest.raises(ValueError, match="qaf was computed with plans"):
         env.reset()
     narrow = TransformedEnv(
         RandomStates(1), Compose(lw.QAFTransform(PLANS), lw.transforms.CorruptQAF({"push": PLANS["push"]}))

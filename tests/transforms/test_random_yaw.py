@@ -181,7 +181,7 @@ def test_plans_require_their_answers():
         lw.RandomYaw(0.1, plans=PLANS)(was)
     pairs = [(f"gripper is {state}", "wait") for state in ("open", "closed", "not open")]
     other = lw.QAFTransform(lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs)]))(was)
-    with pytest.raises(ValueError, match="qaf belongs to plans"):
+    with pytest.raises(ValueError, match="qaf was computed with plans"):
         lw.RandomYaw(0.1, plans=PLANS)(other)
     was["task_id"] = torch.full((64,), lw.task_id("reach"))
     with pytest.raises(ValueError, match="task_id"):

@@ -140,7 +140,7 @@ def import_dataset(
     """
     source, target = Path(source), _new_folder(out)
     if not source.exists():
-        raise FileNotFoundError(f"source: no file or folder {str(source)!r}")
+        raise FileNotFoundError(f"source: no such file or folder {str(source)!r}")
     with _format(_format_of(source) if format is None else format) as module, _reading(source):
         table: Table = module.read(source)
     if table.metadata is not None:

@@ -58,7 +58,10 @@ _Tried = Annotated[
 @typed_fields
 @dataclass(frozen=True)
 class WrongAnswers:
-    """A finding: a plan step's condition was answered wrongly in ``states`` of ``of`` states, first at ``first``."""
+    """A finding that a plan step's condition was evaluated wrongly.
+
+    The evaluation is wrong in ``states`` out of ``of`` states, first at ``first``.
+    """
 
     step: Natural
     condition: str
@@ -159,14 +162,14 @@ class Failure:
         replaced: the replacement that decided the cause, one of :data:`REPLACEMENTS`; None if no replacement did.
         rival: the next best replacement.
         succeeds_at: the time step at which the episode succeeds with ``replaced``, or in a plain re-run.
-        scripted_step: a plan step in which a scripted skill also fixes the episode, although other plan steps have the
-            same fault.
+        scripted_step: a plan step in which using a scripted skill also makes the episode succeed, although other plan
+            steps have the same fault.
         suspect: the cause that the states alone suggest, if ``cause`` is "undecided".
         evidence: numbers measured in the episode's states, by name.
-        counterfactuals: each replacement that was tried (see :func:`attribute_failures`), and whether the episode
-            succeeded with it; a pair like "query + plan" replaces both, where "skill" stands for all plan steps.
-        shares: each replacement, and the fraction of the task's failed episodes that succeed with it; "nothing" is a
-            plain re-run.
+        counterfactuals: for each replacement that was tried (see :func:`attribute_failures`), whether the episode
+            succeeded with it. A pair such as "query + plan" replaces both; in a pair, "skill" means all plan steps.
+        shares: for each replacement, the fraction of the task's failed episodes that succeed with it; "nothing" is
+            a plain re-run.
         mended: the successful re-run with the cause replaced, if there is one; not saved.
     """
 

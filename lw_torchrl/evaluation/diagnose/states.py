@@ -140,7 +140,7 @@ class EpisodeStates(NamedTuple):
 
 
 class Blame(NamedTuple):
-    """The plan step and the state (``at``) at which a cause shows, and the finding there."""
+    """The plan step and the state (``at``) at which a cause becomes visible, and the finding for that state."""
 
     step: int
     at: int
