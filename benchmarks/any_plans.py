@@ -7,7 +7,7 @@ import json
 import random
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
@@ -38,8 +38,8 @@ TEST = tuple(task for task in lw.MT50 if task not in DEVELOPMENT and task not in
 PARAPHRASES = 10  # of each plan
 OURS, NATURAL = lw.load_plans("MT50", skills="MT10"), lw.load_plans("MT50")
 Rows = Literal[
-    "default", "ours", "natural", "own-words", "palm2", "no-points", "dc", "one-hot", "no-roles", "models",
-    "robustness", "evaluator",
+    "default", "carried", "ours", "natural", "own-words", "palm2", "no-points", "dc", "one-hot", "no-roles", "models",
+    "programs", "robustness", "evaluator",
 ]  # fmt: skip
 
 
@@ -64,6 +64,8 @@ class Arguments:
     """PaLM 2's plans, a .json file of pairs; required for "palm2"."""
     answers: Path | None = None
     """Answers of language models, a .jsonl file; required for "models"."""
+    programs: Path | None = None
+    """Programs by style and task, a .json file; required for "programs"."""
     evaluator: Path | None = None
     """Learned query evaluator, from `lw-torchrl train-evaluator`; required for "evaluator"."""
     tasks: tuple[str, ...] = (*DEVELOPMENT, *TEST)
@@ -136,6 +138,13 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
                 written = lw.load_plans(required(arguments.palm2, "palm2"), tasks=lw.TASKS | tasks)
                 yield f"palm2, {points}", "pcbc", Plans([written[task] for task in outside])
                 yield f"default, {points}", "pcbc", Plans([fallback_plan(written[task].definition) for task in outside])
+        elif row == "carried":  # the default plan, but it lifts the object first
+            plans = [fallback_plan(task) for task in outside]
+            yield row, "pcbc", Plans([_carried(plan) for plan in plans])
+        elif row == "programs":  # a text that cannot be read leaves the policy with the default plan
+            for style, texts in read_json(required(arguments.programs, "programs"), "programs").items():
+                plans = [lw.decode_plan(text, task).plan or fallback_plan(task) for task, text in texts.items()]
+                yield f"programs, {style}", "pcbc", Plans(plans)
         elif row == "models":
             for name, plans in of_models(required(arguments.answers, "answers"), seed):
                 yield name, "pcbc", plans
@@ -148,6 +157,16 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
                         yield f"{name}, number {number}", "pcbc", plans
                 else:
                     yield name, "pcbc", Plans([change(NATURAL[task], drawn) for task in outside])
+
+
+def _carried(plan: ConditionalPlan) -> ConditionalPlan:
+    """Return a fallback plan that carries the object instead of sliding it."""
+    roles = [
+        step.role and replace(step.role, verb="carry" if step.role.verb == "move" else step.role.verb)
+        for step in plan.steps
+    ]
+    steps = [replace(step, skill=role.skill, role=role) for step, role in zip(plan.steps, roles, strict=True) if role]
+    return replace(plan, steps=tuple(steps))
 
 
 def required(path: Path | None, name: str) -> Path:

@@ -118,8 +118,8 @@ class GroupSampler(Sampler):
         self._length, self._laid_out, self._restored = self._covered(storage), None, False
         keys = self._keys(storage, self._order[self._start()]) if storage.ndim == 1 else None
         self._written, self._known = [], None if keys is None else keys.reshape(-1).cpu()
-        for group, (start, size) in enumerate(zip(self._start().tolist(), self._size.tolist(), strict=True)):
-            self._shuffle(group, start, size)
+        for rows in self._order.split(self._size.tolist()):
+            self._shuffle(rows.numpy())
 
     def _move_written(self, storage: Storage) -> bool:
         """Move newly written rows to the passes of their groups; return False if all rows must be grouped again."""
@@ -156,22 +156,22 @@ class GroupSampler(Sampler):
     def _start(self) -> Tensor:
         return self._size.cumsum(0) - self._size
 
-    def _shuffle(self, group: int, start: int, size: int) -> None:
-        order = self._order.numpy()
-        order[start : start + size] = order[start : start + size][torch.randperm(size, generator=self._rng).numpy()]
-        self._cursor[group] = 0
+    def _shuffle(self, order: np.ndarray) -> None:
+        """Shuffle the rows of a group (n,) in place."""
+        order[:] = order[torch.randperm(len(order), generator=self._rng).numpy()]
 
-    def _take(self, group: int, start: int, size: int, count: int) -> tuple[np.ndarray, bool]:
-        """Draw ``count`` rows of a group, starting new passes as needed; also return whether a pass ended."""
-        order, cursor, parts, ended = self._order.numpy(), int(self._cursor[group]), list[np.ndarray](), False
+    def _take(self, order: np.ndarray, cursor: int, count: int) -> tuple[np.ndarray, int]:
+        """Draw ``count`` rows of a group with the rows ``order`` (n,), beginning new passes as needed; also return the
+        number of rows drawn since the last pass ended.
+        """
+        parts = []
         while count:
-            parts.append(order[start + cursor : start + min(size, cursor + count)].copy())
+            parts.append(order[cursor : cursor + count].copy())
             cursor, count = cursor + len(parts[-1]), count - len(parts[-1])
-            if cursor == size:
-                ended, cursor = True, 0
-                self._shuffle(group, start, size)
-        self._cursor[group] = cursor
-        return np.concatenate(parts), ended
+            if cursor == len(order):
+                cursor = 0
+                self._shuffle(order)
+        return np.concatenate(parts), cursor
 
     def _layout(self, batch_size: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return the number of rows in each group (G,) and, for each batch row, its group (B,) and its index within
@@ -244,9 +244,10 @@ class GroupSampler(Sampler):
             batches = size / self._weight.numpy()
             longest, first = batches.max(), shares.cumsum() - shares
             for number in ended:
-                rows, is_over = self._take(number, int(starts[number]), int(size[number]), int(shares[number]))
+                own = order[starts[number] : starts[number] + size[number]]
+                rows, cursor[number] = self._take(own, int(cursor[number]), int(shares[number]))
                 index[first[number] : first[number] + len(rows)] = rows
-                self.ran_out |= is_over and bool(batches[number] == longest)
+                self.ran_out |= bool(batches[number] == longest)
         return torch.from_numpy(index), {}
 
     def add(self, index: Any, *, storage: Storage | None = None) -> None:

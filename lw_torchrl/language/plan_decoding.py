@@ -18,7 +18,7 @@ from lw_torchrl.language.formats.python import PythonReading
 from lw_torchrl.language.formats.sentences import SentenceReading
 from lw_torchrl.language.formats.trees import TreeReading
 from lw_torchrl.language.nearest import LIMIT, MappedQuery, StepMapper
-from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line
+from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line, usual_goal
 from lw_torchrl.language.programs import Done, Node, ProgramError, compile_program, tidy
 from lw_torchrl.language.queries import MOST_CLAUSES, Query
 from lw_torchrl.language.skills import Skills, canonical_skill
@@ -194,7 +194,8 @@ def _with_clauses(read: Callable[[str], Reading], text: str, mapper: StepMapper)
         if goal is not None and goal.distance <= LIMIT / 2:
             return str(goal.query)
         with suppress(ValueError):
-            query = skill_effect(canonical_skill(skill, mapper.task), mapper.task)
+            words = canonical_skill(skill, mapper.task)
+            query = usual_goal(words, mapper.task) or skill_effect(words, mapper.task)
             return None if query is None else str(query)
         return None
 
@@ -275,7 +276,7 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
         named = "" if isinstance(clause.condition, str) else f"{shown(words)}: "
         dropped = (
             f"{named}no query is near enough to the condition {shown(unknown[0])} (distance {distance:.2f})"
-            if (unknown)
+            if unknown
             else f"{named}its condition is never true, or too long"
         )
     if dropped:

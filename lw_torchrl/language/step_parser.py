@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from lw_torchrl.language.expressions import TRUE
 from lw_torchrl.language.objects import GOAL, GRIPPER, WORDS
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep, usual_goal
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.roles import Direction, Verb, mark_objects, simplify
 from lw_torchrl.language.tasks import Task, first_object, is_goal, object_of, same_object, whole_objects
@@ -106,8 +106,6 @@ def skill_effect(skill: str, task: Task) -> Query | None:
         >>> print(skill_effect("move above the puck", TASKS["push"]))
         the robot's gripper is above the puck
     """
-    if (goal := usual_goal(skill, task)) is not None:
-        return goal
     step, text = PlanStep(Query(TRUE), skill), simplify(mark_objects(skill, task))
     parsed = _StepParser(step, task, text, _Facts.of(step), grasping=True).parse()
     if parsed is None or parsed.moved is None or parsed.confidence < 0.6:

@@ -252,7 +252,7 @@ DEEP = {
     + "".join(f"    s{n} = 'a' if check('c{n}') else 'b'\n" for n in range(40))
     + f"    robot.move({', '.join(f's{n}' for n in range(40))})",
     "growth": "def push(robot):\n    s = 'aa'\n" + "    s = s + s\n" * 60 + "    robot.move(s)",
-    "calls": "".join(f"def f{n}(r):\n    f{n + 1}(r)\n    f{n + 1}(r)\n" for n in range(40)) + "def f40(r):\n    r.go('x')",
+    "calls": "".join(f"def f{n}(r):\n f{n + 1}(r)\n f{n + 1}(r)\n" for n in range(40)) + "def f40(r):\n r.go('x')",
     "prose": "1. " + "If the gripper is open: " * 2_000,
 }  # fmt: skip
 
@@ -400,7 +400,7 @@ def test_every_action_of_a_behaviour_tree_is_kept():
 
     tree = {"type": "selector", "children": [
         {"type": "sequence", "children": [{"type": "condition", "check": "gripper open"}, leaf(1)]},
-        {"type": "sequence", "children": [{"type": "condition", "check": "gripper near puck", "negate": True}, leaf(2)]},
+        {"type": "sequence", "children": [{"type": "condition", "is": "gripper near puck", "negate": True}, leaf(2)]},
         leaf(3),
     ]}  # fmt: skip
     plan = lw.ConditionalPlan.from_program(json.dumps(tree), "push")

@@ -281,7 +281,7 @@ class _Scope:
         function = " ".join(words_of(_name(node.func)))
         if function in PYTHON["ignored"] or function.split(" ")[-1] in PYTHON["ignored"]:
             return []
-        if not self.is_action(node):
+        if not function or not self.is_action(node):
             self.left_out(node, "the call is not a skill")
             return []
         receiver, verb = self.receiver(node.func), words_of(_name(node.func))

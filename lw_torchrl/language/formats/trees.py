@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import re
+import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
@@ -83,9 +84,11 @@ def _json(text: str) -> Any:
     while parts and parts[-1] == ",":
         parts.pop()
     repaired = "".join([*parts, *reversed(closers)])
-    for parse in (json.loads, ast.literal_eval):
-        with suppress(ValueError, SyntaxError, RecursionError, MemoryError):
-            return parse(repaired)
+    with suppress(ValueError, RecursionError):
+        return json.loads(repaired)
+    with suppress(ValueError, TypeError, SyntaxError, RecursionError, MemoryError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about invalid escapes in the text
+        return ast.literal_eval(repaired)
     return None
 
 

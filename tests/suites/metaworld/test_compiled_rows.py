@@ -326,6 +326,24 @@ def test_pool_waits_for_a_thread_that_is_still_busy(fails):
     pool.close()
 
 
+def test_next_call_waits_for_a_thread_of_an_interrupted_call():
+    pool, done, started = WorkerPool(2), [], threading.Event()
+
+    def interrupted() -> None:
+        if threading.current_thread() is threading.main_thread():
+            assert started.wait(10)
+            raise KeyboardInterrupt
+        started.set()
+        time.sleep(0.05)
+        done.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        pool.run(interrupted, 1)
+    pool.run(lambda: done.append(bool(done)), 0)
+    assert done == [True, True]
+    pool.close()
+
+
 def test_no_two_threads_take_the_same_row():
     @njit(nogil=True)
     def take(counts: np.ndarray, taken: np.ndarray) -> None:
