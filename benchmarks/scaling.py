@@ -442,9 +442,9 @@ def threads(work: Work) -> Iterator[Row]:
 
 def gpu_tests(work: Work) -> Iterator[Row]:
     """The tests that wait for a GPU, if pytest and Hypothesis are installed."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "tests/devices/test_devices.py"]
-    command += ["-k", "gpu or rollout or captured", "-m", "not slow"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    paths = ["tests/devices/test_devices.py", "tests/objectives/test_losses.py"]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *paths, "-k", "gpu", "-m", "not slow"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=90)
     print(done.stdout[-3000:], done.stderr[-1500:], flush=True)
     yield {"row": "tests of a GPU", "rc": done.returncode, "last": (done.stdout.splitlines() or [""])[-1]}
 
