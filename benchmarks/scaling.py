@@ -139,7 +139,6 @@ def cloning_step(work: Work) -> Iterator[Row]:
         yield _measured(work, name, trainer, work.pick(500 if capture else 50, 3), **asked)
         if capture and work.device != "cpu":
             yield _kernels(trainer)
-            yield _profile(trainer, work.pick(300, 3))
 
 
 def _kernels(trainer: Training) -> Row:
@@ -157,23 +156,6 @@ def _kernels(trainer: Training) -> Row:
     row: Row = {"row": "kernels of the step", "kernels": len(kernels)}
     row["us"] = round(sum(each.self_device_time_total for each in kernels))
     return row | {"most": {name: [len(times), round(sum(times))] for name, times in most}}
-
-
-def _profile(trainer: Training, number: int) -> Row:
-    """Print where Python spends the time of a step."""
-    import cProfile
-    import io
-    import pstats
-
-    profiled, out = cProfile.Profile(), io.StringIO()
-    profiled.enable()
-    for _ in range(number):
-        trainer.step()
-    torch.cuda.synchronize()
-    profiled.disable()
-    pstats.Stats(profiled, stream=out).sort_stats("cumulative").print_stats(30)
-    print("\n".join(line[:130] for line in out.getvalue().splitlines()[:45]), flush=True)
-    return {"row": "profile of the step", "steps": number}
 
 
 def few_shot(work: Work) -> Iterator[Row]:

@@ -4,6 +4,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
+from threading import get_ident
 from types import ModuleType
 from typing import Any
 
@@ -101,16 +102,17 @@ class CompiledRows:
         self, rows: Index, inputs: Array, outputs: Array, run: Callable[[Callable[[], object], int], None]
     ) -> Mask:
         """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
-        ``run(call, helpers)`` runs ``call``, which ends when all rows are done, in this thread and at most ``helpers``
-        others."""
+        ``run(call, helpers)`` runs ``call`` in this thread, where it ends when all rows are done, and in at most
+        ``helpers`` others."""
         group = self._group[rows]
         seconds = np.bincount(group, self._table["seconds"][rows]) / np.maximum(np.bincount(group), 1)
         order = np.argsort(-seconds[group], kind="stable")  # the slowest group first
         stable, counts = np.zeros(len(rows), dtype=bool), np.zeros(2, np.int64)
-        handler = self._kernel.leave_mujoco.address
+        handler, caller = self._kernel.leave_mujoco.address, get_ident()
 
         def simulate() -> None:  # refers to self, so that MuJoCo's states stay while a thread is busy
-            self._kernel.simulate(handler, self._table, rows, order, counts, inputs, outputs, stable)
+            waits = get_ident() == caller
+            self._kernel.simulate(handler, self._table, rows, order, counts, inputs, outputs, stable, waits)
 
         run(simulate, len(rows) - 1)
         return stable

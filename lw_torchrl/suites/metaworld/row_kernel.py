@@ -164,15 +164,16 @@ _SIGNATURE = types.void(
     types.float64[:, ::1],
     types.float64[:, ::1],
     types.boolean[::1],
+    types.boolean,
 )
 
 
 @njit(_SIGNATURE, cache=True, nogil=True)
 def simulate(
-    handler: Any, table: Any, rows: Any, order: Any, counts: Any, inputs: Any, outputs: Any, stable: Any
+    handler: Any, table: Any, rows: Any, order: Any, counts: Any, inputs: Any, outputs: Any, stable: Any, waits: Any
 ) -> None:
-    """Simulate the rows that no other thread has taken, and wait for the other rows. All threads of a step call this
-    function at once, with the same arrays.
+    """Simulate the rows that no other thread has taken, and, if ``waits``, wait for the other rows. All threads of a
+    step call this function at once, with the same arrays.
 
     ``handler`` is the address of :func:`leave_mujoco`; ``table`` is a table of :data:`ROW`; ``rows`` (n,) int64 are the
     rows to simulate, and ``order`` (n,) int64 says in which order. ``counts`` (2,) int64 are the numbers of rows taken
@@ -196,7 +197,7 @@ def simulate(
         row.seconds, start = end - start, end
         add_atomically(done, 1)
     # The last rows take less than a millisecond, and a thread that sleeps wakes up late.
-    while add_atomically(done, 0) < len(order):
+    while waits and add_atomically(done, 0) < len(order):
         sched_yield()
     set_error_handler(other_handler)
 

@@ -158,25 +158,21 @@ class WorkerPool:
         if self._process != os.getpid():  # a fork has the pool's locks, but not its threads
             self._stop.detach()
             self._start()
-        if not self._idle:  # an error or Ctrl-C left a call
+        if not self._idle:  # after an error or Ctrl-C, other threads may still be busy
             self._finish()
         self._idle = False
         self._call[0] = call
         for wake in self._wake[:helpers]:
             if wake.locked():  # otherwise this thread has not yet noticed that it was woken up before
                 wake.release()
-        try:
-            call()
-        except BaseException:
-            self._finish()
-            raise
+        call()
         self._call[0] = _do_nothing
         self._idle = True
 
     def _finish(self) -> None:
         """Let no other thread start the call, and wait for those that have started."""
         self._call[0] = _do_nothing
-        for busy in self._busy:
+        for busy in self._busy if self._process == os.getpid() else ():
             with busy:
                 pass
         self._idle = True
@@ -247,7 +243,7 @@ class ThreadedEngine(SeenRows):
     _rows: list[Any]  # each has ``seen`` and ``bodies``
 
     def __init__(self, keys: Sequence[str], layout: Layout, num_threads: int | None) -> None:
-        threads = num_threads or available_cores()
+        threads = max(1, min(num_threads or available_cores(), len(keys)))
         self._groups, self._pool = split_into_groups(keys, threads), WorkerPool(threads)
         self._layout = layout
         self._goal = np.zeros((len(keys), 3))
@@ -263,7 +259,7 @@ class ThreadedEngine(SeenRows):
     def _simulate(self, rows: Index, inputs: Array, outputs: Array) -> Mask:
         """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
 
-        The Python threads are slower than the kernel, which has the same bits: they run ten Python calls a row.
+        Without the kernel, Python threads give the same bits, more slowly: they make ten Python calls a row.
         """
         if self._compiled is not None:
             return self._compiled.simulate(rows, inputs, outputs, self._pool.run)

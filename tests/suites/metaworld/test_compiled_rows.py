@@ -326,20 +326,38 @@ def test_pool_waits_for_a_thread_that_is_still_busy(fails):
     pool.close()
 
 
+def test_next_call_waits_for_a_thread_of_an_interrupted_call():
+    pool, done, started = WorkerPool(2), [], threading.Event()
+
+    def interrupted() -> None:
+        if threading.current_thread() is threading.main_thread():
+            assert started.wait(10)
+            raise KeyboardInterrupt
+        started.set()
+        time.sleep(0.05)
+        done.append(True)
+
+    with pytest.raises(KeyboardInterrupt):
+        pool.run(interrupted, 1)
+    pool.run(lambda: done.append(bool(done)), 0)
+    assert done == [True, True]
+    pool.close()
+
+
 def test_no_two_threads_take_the_same_row():
     @njit(nogil=True)
-    def take(counts: np.ndarray, times: int) -> None:
-        for _ in range(times):
-            row_kernel.add_atomically(counts.ctypes.data, 1)
+    def take(counts: np.ndarray, taken: np.ndarray) -> None:
+        for k in range(len(taken)):
+            taken[k] = row_kernel.add_atomically(counts.ctypes.data, 1)
 
-    counts = np.zeros(1, np.int64)
-    take(counts, 0)
-    threads = [threading.Thread(target=take, args=(counts, 1_000_000)) for _ in range(4)]
+    counts, taken = np.zeros(1, np.int64), np.zeros((3, 1_000_000), np.int64)
+    take(counts, taken[0, :0])
+    threads = [threading.Thread(target=take, args=(counts, numbers)) for numbers in taken]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert counts[0] == 4_000_000
+    assert np.array_equal(np.sort(taken.ravel()), np.arange(taken.size))
 
 
 @pytest.mark.parametrize("last", range(3))
@@ -353,6 +371,13 @@ def test_call_returns_when_all_rows_are_done(last):
         steps = [now * 100_000 if row == last else now for row in range(3)]
         assert [round(row.data.time / row.model.opt.timestep) for row in rows] == steps
     pool.close()
+
+
+def test_engine_has_no_more_threads_than_rows():
+    before = set(threading.enumerate())
+    engine = VectorizedEngine(["reach", "push"], num_threads=16)
+    assert len(set(threading.enumerate()) - before) == 1
+    engine.close()
 
 
 def test_closed_and_collected_pools_end_their_threads():
