@@ -547,7 +547,7 @@ def main(arguments: list[str] | None = None) -> int:
         options = json.dumps({"folder": str(args.folder), "quick": args.quick, "device": work.device, "left": left})
         before = len(_rows(work))
         subprocess.run([*command, options], check=False)
-        begun = [row["begins"] for row in _rows(work)[before:] if "begins" in row]
+        begun = [row["begins"] for row in _rows(work)[before:] if row.get("begins") in names]
         skipped = {row["row"] for row in _rows(work)[before:] if row.get("error") == "no time left"}
         names = [name for name in names[names.index(begun[-1]) + 1 :] if name not in skipped] if begun else []
     rows = [row for row in _rows(work) if "begins" not in row]
