@@ -139,7 +139,6 @@ def cloning_step(work: Work) -> Iterator[Row]:
         yield _measured(work, name, trainer, work.pick(500 if capture else 50, 3), **asked)
         if capture and work.device != "cpu":
             yield _kernels(trainer)
-            yield _profile(trainer, work.pick(300, 3))
 
 
 def _kernels(trainer: Training) -> Row:
@@ -157,23 +156,6 @@ def _kernels(trainer: Training) -> Row:
     row: Row = {"row": "kernels of the step", "kernels": len(kernels)}
     row["us"] = round(sum(each.self_device_time_total for each in kernels))
     return row | {"most": {name: [len(times), round(sum(times))] for name, times in most}}
-
-
-def _profile(trainer: Training, number: int) -> Row:
-    """Print where Python spends the time of a step."""
-    import cProfile
-    import io
-    import pstats
-
-    profiled, out = cProfile.Profile(), io.StringIO()
-    profiled.enable()
-    for _ in range(number):
-        trainer.step()
-    torch.cuda.synchronize()
-    profiled.disable()
-    pstats.Stats(profiled, stream=out).sort_stats("cumulative").print_stats(30)
-    print("\n".join(line[:130] for line in out.getvalue().splitlines()[:45]), flush=True)
-    return {"row": "profile of the step", "steps": number}
 
 
 def few_shot(work: Work) -> Iterator[Row]:
@@ -442,9 +424,9 @@ def threads(work: Work) -> Iterator[Row]:
 
 def gpu_tests(work: Work) -> Iterator[Row]:
     """The tests that wait for a GPU, if pytest and Hypothesis are installed."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "tests/devices/test_devices.py"]
-    command += ["-k", "gpu or rollout or captured", "-m", "not slow"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    paths = ["tests/devices/test_devices.py", "tests/objectives/test_losses.py"]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *paths, "-k", "gpu", "-m", "not slow"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=90)
     print(done.stdout[-3000:], done.stderr[-1500:], flush=True)
     yield {"row": "tests of a GPU", "rc": done.returncode, "last": (done.stdout.splitlines() or [""])[-1]}
 
@@ -565,7 +547,7 @@ def main(arguments: list[str] | None = None) -> int:
         options = json.dumps({"folder": str(args.folder), "quick": args.quick, "device": work.device, "left": left})
         before = len(_rows(work))
         subprocess.run([*command, options], check=False)
-        begun = [row["begins"] for row in _rows(work)[before:] if "begins" in row]
+        begun = [row["begins"] for row in _rows(work)[before:] if row.get("begins") in names]
         skipped = {row["row"] for row in _rows(work)[before:] if row.get("error") == "no time left"}
         names = [name for name in names[names.index(begun[-1]) + 1 :] if name not in skipped] if begun else []
     rows = [row for row in _rows(work) if "begins" not in row]
