@@ -248,13 +248,11 @@ class Read:
         """
         from lw_torchrl.language.plan_decoding import decode_plan
 
-        task, format = self.task or re.sub(r"-\d+$", "", file.stem), self.format or file.absolute().parent.name
+        task, folder = self.task or re.sub(r"-\d+$", "", file.stem), file.absolute().parent.name
+        format = self.format or (folder if folder in PLAN_FORMATS else None)
         known = options.read_tasks(self.task_file, (task,) if self.task else ())
         if task not in known and self.task is None:
             raise ValueError(f"--task is required, because the file name {file.name!r} does not name a task")
-        if format not in PLAN_FORMATS and self.format is None:
-            known_formats = ", ".join(PLAN_FORMATS)
-            raise ValueError(f"--format is required (one of {known_formats}): folder {format!r} is not a format")
         decoded = decode_plan(read_text(file, ValueError), task, format, tasks=known)
         if decoded.plan is None and len(self.sources) == 1:
             raise PlanError(f"{file}: no plan can be read: {decoded.reason}")

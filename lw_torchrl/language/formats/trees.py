@@ -49,9 +49,13 @@ class TreeReading(Reading):
             except (RecursionError, ValueError):
                 self.error = "the tree is too large or nests too deeply"
                 continue
-            is_listing = isinstance(value, list) and not any(isinstance(each, dict | list) for each in value)
+            is_listing = "{" not in str(value)
             texts = [action.text.split() for action in actions_of(node)]
-            if node is not None and texts and (not is_listing or all(map(is_verb, texts))):
+            if (
+                node is not None
+                and texts
+                and not (is_listing and any(len(words) < 2 or not is_verb(words) for words in texts))
+            ):
                 self.add_tree("", start + 1, node)
 
 
