@@ -95,7 +95,7 @@ class PointingNetwork(ClauseNetwork):
         height, width = features.shape[-2:]
         scores = torch.einsum("nk,bkp->bnp", objects, self.key(features).flatten(-2))
         attention = (_SHARP / sqrt(KEYS) * scores).softmax(-1)
-        axes = [torch.linspace(-1.0, 1.0, size, device=seen.device, dtype=seen.dtype) for size in (height, width)]
+        axes = [torch.linspace(-1.0, 1.0, size, device=seen.device, dtype=features.dtype) for size in (height, width)]
         grid = torch.stack(torch.meshgrid(*axes, indexing="ij")).flatten(-2)
         values = torch.cat((grid.expand(len(features), -1, -1), self.seen(features).flatten(-2)), -2)
         attended = torch.einsum("bnp,bfp->bnf", attention, values)  # (B·C, N, 2 + 16)
