@@ -18,8 +18,8 @@ from tyro.conf import Positional, arg
 import lw_torchrl as lw
 from lw_torchrl._util.checks import Count, counted
 from lw_torchrl._util.files import read_text
-from lw_torchrl._util.workers import start_early
 from lw_torchrl._util.text import printable
+from lw_torchrl._util.workers import start_early
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills

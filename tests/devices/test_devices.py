@@ -94,6 +94,7 @@ def make_replay(demos, device=None):
     return lw.LanguageWorldExperienceReplay(demos, sampler=lw.TaskBalancedSampler(), transform=transform, device=device)
 
 
+@pytest.mark.filterwarnings("ignore:Synchronization debug mode")
 @needs_a_gpu
 def test_gpu_is_never_waited_for(demos, tmp_path):
     """CUDA itself reports waits. Draws equal the CPU's, and sums nearly so."""
