@@ -129,7 +129,7 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     """
     task, parsed = plan.definition, parse_steps(plan)
     read = _with_roles(plan, parsed)
-    confidence, motion = _confidence(task, read), _final_motion(task, read)
+    confidence, motion = _confidence(task, read), _final_motion(read)
     source: Source
     if confidence >= MIN_CONFIDENCE and _is_complete(read):
         source, steps = "plan", read
@@ -264,11 +264,11 @@ def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
     return direct
 
 
-def _final_motion(task: Task, steps: Sequence[PlanStep]) -> StepRole | None:
+def _final_motion(steps: Sequence[PlanStep]) -> StepRole | None:
     """Return the motion that ends at the goal, in a plan in any order; otherwise the last motion."""
-    roles = [_role(step) for step in steps]
-    to_goal = [role for role in roles if role.verb in ("carry", "move") and is_goal(task, role.target)]
-    return motion_of(to_goal or roles)
+    moving = [step for step in steps if _role(step).verb in ("carry", "move") and not is_free(step)]
+    to_goal = [step for step in moving if _role(step).target == GOAL]
+    return motion_of([_role(step) for step in to_goal or steps])
 
 
 def _is_complete(steps: Sequence[PlanStep]) -> bool:
