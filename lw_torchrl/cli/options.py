@@ -103,7 +103,12 @@ def _plain(value: Any) -> Any:
 
 def _cell(row: Row, column: str | Callable[[Row], Any]) -> str:
     value = row[column] if isinstance(column, str) else column(row)
-    return "" if value is None or value is False else "yes" if value is True else str(value)
+    return "" if value is None or value is False else "yes" if value is True else printable(str(value))
+
+
+def printable(text: str) -> str:
+    """Escape control characters, which could change the terminal."""
+    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
 
 
 def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

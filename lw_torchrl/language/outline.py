@@ -42,7 +42,7 @@ def outline(guards: Sequence[Any]) -> list[Line]:
 
     Example:
         >>> from lw_torchrl.language.queries import parse_query
-        >>> texts = ["gripper near puck and gripper closed", "gripper near puck and not closed", "gripper not near puck"]
+        >>> texts = ["gripper near puck and closed", "gripper near puck and not closed", "gripper not near puck"]
         >>> for line in outline([parse_query(text, "push") for text in texts]):
         ...     print("  " * line.depth + str(line))
         if gripper near puck
@@ -149,4 +149,3 @@ def _short_conjunction(listed: Sequence[Clause]) -> str:
             negated = clause.negated
         parts.append(" ".join(filter(None, [*words, target])))
     return " and ".join(parts)
-

@@ -206,7 +206,9 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
         texts.append("  \n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
     stream.send_columns(f"{root}/plan", episode.times(rows), documents)
-    full = "  \n".join(f"{i}.  if {condition}  \n{INDENT}{skill}" for i, (condition, skill) in enumerate(episode.steps, 1))
+    full = "  \n".join(
+        f"{i}.  if {condition}  \n{INDENT}{skill}" for i, (condition, skill) in enumerate(episode.steps, 1)
+    )
     stream.log(f"{root}/conditions", rr.TextDocument(full, media_type=rr.MediaType.MARKDOWN), static=True)
     reasons = [max(episode.reasons, key=len, default="")]
     return sum(-(-len(text) // LINE) for text in [INDENT * line.depth + text for line, text in lines] + reasons)

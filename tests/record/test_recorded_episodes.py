@@ -12,11 +12,11 @@ from PIL import Image
 from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, record
 
 from lw_torchrl.language.objects import GRIPPER
+from lw_torchrl.language.outline import short_condition
 from lw_torchrl.language.queries import Clause, Query, parse_query
 from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.page import EVENLY, NONE_HOLDS
-from lw_torchrl.language.outline import short_condition
 from lw_torchrl.record.recorded_episode import NO_STEP, RecordedEpisode
 from lw_torchrl.record.scene import ROBOT_EYE, name_offsets
 from lw_torchrl.record.tabs import Tabs
