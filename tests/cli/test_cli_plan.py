@@ -38,7 +38,7 @@ def test_read_shows_how_each_step_was_parsed(capsys, tmp_path):
         ["if gripper not above mug"],
         ["put the gripper over a mug", "approach", "robot's gripper", "mug rim", "1.0"],
         ["if gripper near mug"],
-        ["grab it", "close", "robot's gripper", "mug rim", "0.8"],
+        ["grab it", "close", "robot's gripper", "mug rim", "1.0"],
         ["bring the mug to the goal", "carry", "mug", "target location", "1.0"],
         ["if gripper closed"],
         ["be careful", "left out: no motion of an object is recognised"],
