@@ -201,7 +201,7 @@ class Read:
     sources: Positional[Annotated[tuple[str, ...], options.REQUIRED, arg(metavar="SOURCES", help=_SOURCES)]]
     task: Maybe[str] = None  # show only the plan for this task (default for an answer: the task in the file name)
     format: Maybe[str] = None  # plan format of an answer (default: the folder's name, or found by the content)
-    out: Maybe[Path] = None  # folder to which the most confident plan for each task is written as a .plan file
+    out: Maybe[Path] = None  # folder for the most confident plan of each task, as a .plan file (not completed)
     task_file: options.TaskFile = None
     json: options.Json = False
 
@@ -296,7 +296,7 @@ def _tree(notes: Sequence[Row], report: CanonicalReport, decoded: DecodedPlan | 
     absent = [step for step in decoded_steps if step.dropped]
     tree += [{**nothing, "written": step.written_skill, "line": step.line, "dropped": step.dropped} for step in absent]
     if report.source != "plan":
-        tree.append({"depth": 0, "head": f"{_INSTEAD[report.source]}, policies see:"})
+        tree.append({"depth": 0, "head": f"{_INSTEAD[report.source]}; policies on canonical plans see:"})
         tree += _branches([{**row, "line": None, "dropped": None} for row in notes[count:]], report.plan, 1)
     return tree
 

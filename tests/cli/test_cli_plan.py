@@ -42,7 +42,7 @@ def test_read_shows_how_each_step_was_parsed(capsys, tmp_path):
         ["bring the mug to the goal", "carry", "mug", "target location", "1.0"],
         ["if gripper closed"],
         ["be careful", "left out: no motion of an object is recognised"],
-        ["completed, policies see:"],
+        ["completed; policies on canonical plans see:"],
         ["if gripper not near mug rim"],
         ["if gripper not above mug rim"],
         ["place the gripper above the mug rim", "approach", "robot's gripper", "mug rim"],
