@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any
+from typing import Any, TypeAlias
 
 from lw_torchrl.language.expressions import Expression, all_of, as_expression, leaves, negate, write
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import TOUCHING
+
+MOST_DEPTH = 12  # maximum nesting; deeper branches have one step each
+_Parts: TypeAlias = dict[Expression, None]  # the parts of a conjunction, in order
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ def outline(guards: Sequence[Any]) -> list[Line]:
     """
     parts = [_parts(guard.expression if isinstance(guard, Query) else as_expression(guard)) for guard in guards]
     lines = list[Line]()
-    _arrange(list(enumerate(parts)), 0, lines)
+    _arrange([(number, dict.fromkeys(each)) for number, each in enumerate(parts)], 0, lines)
     return lines
 
 
@@ -64,14 +67,14 @@ def _parts(expression: Expression) -> tuple[Expression, ...]:
     return expression.parts if expression.kind == "all" else (expression,)
 
 
-def _implies(parts: Sequence[Expression], other: Expression) -> bool:
-    """Return whether a conjunction implies another expression, as far as its form shows."""
-    if other in parts or other.kind == "leaf":
+def _implies(parts: _Parts, other: Expression, levels: int = 2) -> bool:
+    """Return whether a conjunction implies another expression, as far as the form of its first levels shows."""
+    if other in parts or not levels or other.kind == "leaf":
         return other in parts
-    return (all if other.kind == "all" else any)(_implies(parts, part) for part in other.parts)
+    return (all if other.kind == "all" else any)(_implies(parts, part, levels - 1) for part in other.parts)
 
 
-def _arrange(steps: Sequence[tuple[int, tuple[Expression, ...]]], depth: int, lines: list[Line]) -> None:
+def _arrange(steps: Sequence[tuple[int, _Parts]], depth: int, lines: list[Line]) -> None:
     """Append the outline of steps, each an index and the parts of its guard that are not yet written."""
     excluded = list[Expression]()  # the negations of the branches above, while "else" can follow
     at = 0
@@ -84,7 +87,7 @@ def _arrange(steps: Sequence[tuple[int, tuple[Expression, ...]]], depth: int, li
         follows = bool(excluded) and all(_implies(parts, negation) for negation in excluded)
         if not follows:
             excluded = []
-        run = _run(steps[at:], excluded)
+        run = _run(steps[at:] if depth < MOST_DEPTH else steps[at : at + 1], excluded)
         shared = [part for part in run[0][1] if all(part in other for _, other in run)]
         head = "if" if not follows else "else if" if shared else "else"
         branch = all_of(shared)
@@ -94,15 +97,13 @@ def _arrange(steps: Sequence[tuple[int, tuple[Expression, ...]]], depth: int, li
         at += len(run)
 
 
-def _run(
-    steps: Sequence[tuple[int, tuple[Expression, ...]]], excluded: Sequence[Expression]
-) -> list[tuple[int, tuple[Expression, ...]]]:
+def _run(steps: Sequence[tuple[int, _Parts]], excluded: Sequence[Expression]) -> list[tuple[int, _Parts]]:
     """Return the steps of the next branch, without the parts of their guards that "else" states.
 
     The branch holds the most steps in a row that share a part of the first step's guard.
     """
     stated = {part for negation in excluded for part in _parts(negation)}
-    run = list[tuple[int, tuple[Expression, ...]]]()
+    run = list[tuple[int, _Parts]]()
     shared: set[Expression] | None = None
     for number, parts in steps:
         rest = _without(parts, stated)
@@ -116,8 +117,8 @@ def _run(
     return run
 
 
-def _without(parts: Sequence[Expression], stated: Any) -> tuple[Expression, ...]:
-    return tuple(part for part in parts if part not in stated)
+def _without(parts: _Parts, stated: Any) -> _Parts:
+    return {part: None for part in parts if part not in stated}
 
 
 def short_condition(condition: Any) -> str:
