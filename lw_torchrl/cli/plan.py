@@ -6,19 +6,25 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
 from lw_torchrl._util.checks import Count, Natural, Positive, Probability, Scale, check_choice, counted
 from lw_torchrl._util.files import read_text
+from lw_torchrl._util.text import printable
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Columns, Flag, Maybe, Output, Row
 from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.outline import outline
 from lw_torchrl.language.plans import PlanError, Plans
 from lw_torchrl.language.tasks import Task, check_task
 from lw_torchrl.suites.suite import load_suite
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.canonical import CanonicalReport
+    from lw_torchrl.language.plan_decoding import DecodedPlan
 
 _FORMATS = "basic, chain or goal, followed by _py, _py_md or _md"
 _PLANNER_OPTIONS = (
@@ -178,7 +184,9 @@ class Repair(_Model):
 
 @dataclass(kw_only=True)
 class Read:
-    """Show, step by step, how free-form plans are parsed, with a confidence score; --out saves the parsed plans.
+    """Show, step by step, how plans and programs are parsed, with a confidence score; --out saves the parsed plans.
+
+    The steps are nested below the conditions that they share. A program may be Python, JSON, YAML or prose.
 
     The confidence is the fraction of typical states of the motion in which the plan, as written, chooses a correct
     step. A plan with a confidence below 0.75 keeps its motion and objects, but gets standard conditions. A plan without
@@ -186,47 +194,45 @@ class Read:
 
     Example: lw-torchrl plan read my-plans/coffee-pull.plan
 
+    Example: lw-torchrl plan read push.py
+
     Example: lw-torchrl plan read runs/plans/llama3.1/chain_py/*.py --out my-plans
     """
 
     sources: Positional[Annotated[tuple[str, ...], options.REQUIRED, arg(metavar="SOURCES", help=_SOURCES)]]
     task: Maybe[str] = None  # show only the plan for this task (default for an answer: the task in the file name)
-    format: Maybe[str] = None  # plan format of an answer (default: the name of the answer's folder)
-    out: Maybe[Path] = None  # folder to which the most confident plan for each task is written as a .plan file
+    format: Maybe[str] = None  # plan format of an answer (default: the folder's name, or found by the content)
+    out: Maybe[Path] = None  # folder for the most confident plan of each task, as a .plan file (not completed)
     task_file: options.TaskFile = None
     json: options.Json = False
 
     def run(self) -> Output:
         from lw_torchrl.language.canonical import explain_canonical, most_confident
 
-        plans = [plan for source in self.sources for plan in self._plans(source)]
-        reports, steps = [explain_canonical(plan) for plan in plans], []
-        for report in reports:
-            source = f"{report.source}, confidence {report.plan.confidence:.2f}"
-            steps += [{"task": report.written.task, "source": source, **note} for note in report.notes()]
-        columns: Columns = {
-            "task": "task",
-            "plan": "source",
-            "as written": lambda row: row["written"] or "(added)",
-            "parsed as": lambda row: row["skill"] or "(dropped: cannot be parsed)",
-            "if": lambda row: row["condition"] or "",
-            "confidence": lambda row: f"{row['confidence']:.1f}" if row["written"] else "",
-            "seen": "seen",
-        }
-        output = Output(self.json).table("read", steps, columns, counted(len(reports), "plan"))
-        rows = [
-            {"task": report.written.task, "source": report.source, "confidence": report.plan.confidence}
-            for report in reports
-        ]
-        output.show("plans", rows)
+        plans = list[lw.ConditionalPlan]()
+        output, rows, summaries = Output(self.json), list[Row](), list[Row]()
+        for source in self.sources:
+            for plan, decoded in self._plans(source):
+                report = explain_canonical(plan)
+                where = {"task": plan.task, "source": f"{report.source}, confidence {report.plan.confidence:.2f}"}
+                tree = _tree(report.notes(), report, decoded)
+                rows += [{**where, **row} for row in tree if "written" in row]
+                notes = [] if decoded is None else [str(note) for note in decoded.notes]
+                known = {"task": plan.task, "source": report.source, "confidence": report.plan.confidence}
+                summaries.append({**known, "notes": notes})
+                plans.append(plan)
+                if not self.json:
+                    output.table("", tree, _COLUMNS, f"{source}: {', '.join(where.values())}")
+                    print(*(f"{printable(note)}\n" for note in notes), sep="")
+        output.show("read", rows).show("plans", summaries)
         if self.out is not None:
             tasks = dict.fromkeys(plan.task for plan in plans)
             best = [most_confident(plan for plan in plans if plan.task == task) for task in tasks]
             output.show("files", lw.save_plans(Plans(best), self.out), f"{counted(len(best), 'plan')} in {self.out}")
         return output
 
-    def _plans(self, source: str) -> list[lw.ConditionalPlan]:
-        """Return the plans in a source; with --task, only the plan for that task."""
+    def _plans(self, source: str) -> list[tuple[lw.ConditionalPlan, DecodedPlan | None]]:
+        """Return the plans in a source, each with the decoded text of an answer; with --task, only that task's plan."""
         file = Path(source)
         if file.is_file() and file.suffix not in (".plan", ".json"):
             return self._decoded(file)
@@ -237,26 +243,76 @@ class Read:
             suite = load_suite(source)
             known, plans = suite.tasks, Plans(suite.plans or {})
         if self.task is None:
-            return list(plans.values())
+            return [(plan, None) for plan in plans.values()]
         check_task(self.task, known)
         plans.require([self.task])
-        return [plans[self.task]]
+        return [(plans[self.task], None)]
 
-    def _decoded(self, file: Path) -> list[lw.ConditionalPlan]:
+    def _decoded(self, file: Path) -> list[tuple[lw.ConditionalPlan, DecodedPlan | None]]:
         """Return a list with the plan in a language model's answer. Without a plan, raise a PlanError if this is the
         only source, otherwise return an empty list.
         """
         from lw_torchrl.language.plan_decoding import decode_plan
 
-        task, folder = self.task or re.sub(r"-\d+$", "", file.stem), file.absolute().parent.name
-        format = self.format or (folder if folder in PLAN_FORMATS else None)
+        task, format, folder = self.task or re.sub(r"-\d+$", "", file.stem), self.format, file.absolute().parent.name
         known = options.read_tasks(self.task_file, (task,) if self.task else ())
         if task not in known and self.task is None:
             raise ValueError(f"--task is required, because the file name {file.name!r} does not name a task")
+        if format is None and folder in PLAN_FORMATS:
+            format = folder
         decoded = decode_plan(read_text(file, ValueError), task, format, tasks=known)
-        if decoded.plan is None and len(self.sources) == 1:
+        if decoded.plan is not None:
+            return [(decoded.plan, decoded)]
+        if len(self.sources) == 1:
             raise PlanError(f"{file}: no plan can be read: {decoded.reason}")
-        notes = decoded.notes if decoded.plan is not None else [f"no plan can be read: {decoded.reason}"]
-        for note in notes:
-            print(f"{file}: {note}")
-        return [] if decoded.plan is None else [decoded.plan]
+        print(f"{file}: no plan can be read: {printable(decoded.reason)}")
+        return []
+
+
+_COLUMNS: Columns = {
+    "plan": lambda row: "  " * row["depth"] + (row["head"] if "head" in row else row["written"] or row["skill"]),
+    "verb": lambda row: row.get("verb"),
+    "object": lambda row: row.get("moved"),
+    "target": lambda row: row.get("target"),
+    "confidence": lambda row: f"{row['confidence']:.1f}" if row.get("written") and row["skill"] else "",
+    "note": lambda row: "" if row.get("dropped") is None else f"left out: {row['dropped']}",
+}
+
+
+def _tree(notes: Sequence[Row], report: CanonicalReport, decoded: DecodedPlan | None) -> list[Row]:
+    """Return the lines of a plan's tree: heads of branches, and steps as in :meth:`CanonicalReport.notes`.
+
+    A step also has its ``line`` in the text, the ``path`` of heads above it, and why it was ``dropped``. Steps that are
+    not in the plan follow at the end, and then the steps that replace the plan's own.
+    """
+    count = len(report.written.steps)
+    decoded_steps = () if decoded is None else decoded.steps
+    at: list[int | None] = [step.line for step in decoded_steps if not step.dropped] or [None] * count
+    own = [
+        {**row, "line": line, "dropped": None if row["skill"] else "no motion of an object is recognised"}
+        for row, line in zip(notes[:count], at, strict=True)
+    ]
+    tree = _branches(own, report.written)
+    nothing: Row = {**dict.fromkeys(notes[0]), "confidence": 0.0, "seen": False, "depth": 0, "path": []}
+    absent = [step for step in decoded_steps if step.dropped]
+    tree += [{**nothing, "written": step.written_skill, "line": step.line, "dropped": step.dropped} for step in absent]
+    if report.source != "plan":
+        tree.append({"depth": 0, "head": f"{_INSTEAD[report.source]}; policies on canonical plans see:"})
+        tree += _branches([{**row, "line": None, "dropped": None} for row in notes[count:]], report.plan, 1)
+    return tree
+
+
+_INSTEAD = {"completed": "completed", "fallback": "replaced by the fallback plan"}
+
+
+def _branches(rows: Sequence[Row], plan: lw.ConditionalPlan, depth: int = 0) -> list[Row]:
+    """Arrange the rows of a plan's steps by their conditions."""
+    tree, path = list[Row](), list[str]()
+    for line in outline([step.condition for step in plan.steps]):
+        del path[line.depth :]
+        if line.head:
+            path.append(str(line))
+            tree.append({"depth": depth + line.depth, "head": str(line)})
+        else:
+            tree.append({**rows[line.steps[0]], "depth": depth + line.depth, "path": [*path]})
+    return tree

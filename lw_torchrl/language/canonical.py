@@ -52,9 +52,10 @@ class CanonicalReport:
     source: Source
     read: tuple[PlanStep, ...]  # the plan's own steps as parsed, even if ``plan`` has different steps
     left_out: tuple[str, ...]  # the skills that could not be parsed
+    is_read: tuple[bool, ...]  # whether each step of ``written`` is in ``read``
 
     def notes(self) -> list[dict[str, Any]]:
-        """Return a JSON row for each parsed step, each step that replaces the plan's own, and each step left out.
+        """Return a JSON row for each step of ``written``, then one for each step that replaces the plan's own.
 
         The keys are ``written`` (None for an added step); ``skill``, ``verb``, ``moved``, ``target`` and ``condition``
         (None for a step that was left out); ``confidence``; and ``seen``, whether policies see the step.
@@ -66,12 +67,14 @@ class CanonicalReport:
             rest = {"condition": str(step.condition), "confidence": role.confidence, "seen": seen}
             return {"written": role.written or None, **parsed, **rest}
 
-        is_own = self.source == "plan"
-        notes = [note(step, is_own) for step in self.read] + [
-            note(step, True) for step in self.plan.steps if not is_own
-        ]
+        is_own, read = self.source == "plan", iter(self.read)
         nothing = dict.fromkeys(("skill", "verb", "moved", "target", "condition"))
-        return notes + [{"written": skill, **nothing, "confidence": 0.0, "seen": False} for skill in self.left_out]
+        return [
+            note(next(read), is_own)
+            if is_read
+            else {"written": step.skill, **nothing, "confidence": 0.0, "seen": False}
+            for step, is_read in zip(self.written.steps, self.is_read, strict=True)
+        ] + [note(step, True) for step in self.plan.steps if not is_own]
 
 
 @typed
@@ -145,7 +148,7 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
         reasons += [f"as written: {written}"] if written and written != step.skill else []
         explained.append(replace(step, reason="; ".join(reasons)))
     canonical = ConditionalPlan(plan.task, tuple(explained), task, confidence)
-    return CanonicalReport(plan, canonical, source, read, left_out)
+    return CanonicalReport(plan, canonical, source, read, left_out, tuple(map(_has_role, parsed)))
 
 
 def fallback_plan(task: str | Task) -> ConditionalPlan:
@@ -183,10 +186,14 @@ def _negated(query: Query) -> Query:
     return Query(negate(query.expression))
 
 
+def _has_role(each: ParsedStep | None) -> bool:
+    return each is not None and bool(each.moved and each.target)
+
+
 def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> tuple[PlanStep, ...]:
     """Return the steps that could be parsed, each with its role."""
     task = plan.definition
-    pairs = [(step, each) for step, each in zip(plan.steps, parsed, strict=True) if each and each.moved and each.target]
+    pairs = [(step, each) for step, each in zip(plan.steps, parsed, strict=True) if each and _has_role(each)]
     read = [each for _, each in pairs]
     grasping = any(each.verb in ("close", "carry", "move") for each in read)
     first = first_object(task)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lw_torchrl.language.outline import short_condition
 from lw_torchrl.language.relations import STATES
 from lw_torchrl.record.entities import (
     EPISODE_TIMELINE,
@@ -36,6 +38,7 @@ _WRONG = "false, answered true", "true, answered false"
 FAILED: Color = (215, 75, 75)
 WRONG: Color = (200, 60, 140)
 TOUCHES_CLOSED, TOUCHES_OPEN = (225, 130, 60), (150, 165, 220)
+LONGEST_LANE = 130  # maximum number of characters of a lane's title
 MANY_LANES = 9  # with more timeline lanes, a small window has little room for the verdict
 CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
     "distance": ("Distance to the target, cm", None),
@@ -102,7 +105,8 @@ def log_lanes(
         _log_active_step(stream, lanes, f"{0:0{digits}}c ghost with {ghost.by}", ghost.episode, "ghost")
     for column in range(0 if episode.qaf is None else columns):
         assert episode.qaf is not None
-        condition = episode.short_conditions[column] if episode.steps else "condition"
+        condition = short_condition(episode.guards[column]) if episode.steps else "condition"
+        condition = shorten(condition, LONGEST_LANE, placeholder=" etc")
         truth = np.where(episode.qaf[:, column], "true", "false")
         if episode.believed is not None:
             believed = episode.believed[:, column]
@@ -177,7 +181,8 @@ class Page:
             share = min(0.2 + 0.1 * self.pictures, 0.5)
             scene = rrb.Horizontal(scene, self._pictures(), column_shares=[1 - share, share])
         left: list[tuple[float, Any]] = [(max(150, 500 - plan), scene)] if self.has_scene or self.pictures else []
-        left += [(plan, self._text("plan", "Plan"))] if plan else []
+        texts = rrb.Tabs(self._text("plan", "Plan"), self._text("conditions", "Conditions in full"))
+        left += [(plan, texts)] if plan else []
         left += [(105, rrb.Tabs(*(self._curve(name) for name in CURVES if name in self.curves)))] if self.curves else []
         right = self._lanes(self.lanes)
         right.insert(0, (max(100, 605 - sum(share for share, _ in right)), self._text("verdict", "Verdict")))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import groupby
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,11 +12,8 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
-from lw_torchrl.language.expressions import write
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.queries import Clause, Query
-from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.record.entities import STEP_TIME, check_image, time_columns
@@ -65,7 +61,7 @@ class RecordedEpisode:
     reward: NDArray[np.float32] | None = None  # T, reward of the row's action
     corrected: NDArray[np.float32] | None = None  # T, the weight of a learned correction to the action
     steps: tuple[tuple[str, str], ...] = ()  # S (condition, skill) texts; empty without a plan
-    short_conditions: tuple[str, ...] = ()  # S shortened condition texts
+    guards: tuple[Any, ...] = ()  # S conditions: queries, or the objects of another plan
     reasons: tuple[str, ...] = ()  # S texts: a plan step's comment, or the skill as originally written
     confidence: float | None = None  # confidence score of a canonical plan
     target_poses: tuple[TargetPose | None, ...] = ()  # S; None for a skill that is not scripted
@@ -205,7 +201,7 @@ class RecordedEpisode:
             reward=optional(("next", "reward"), flat=True),
             corrected=optional("action_corrected", flat=True),
             steps=steps,
-            short_conditions=() if plan is None else tuple(short_condition(step.condition) for step in plan.steps),
+            guards=() if plan is None else tuple(step.condition for step in plan.steps),
             reasons=() if plan is None else tuple(map(_reason, plan.steps)),
             confidence=getattr(plan, "confidence", None),
             pixels=None if pixels is None else np.stack([check_image("pixels", picture) for picture in pixels]),
@@ -231,37 +227,6 @@ class Ghost:
         distances = [np.linalg.norm(difference[:, place], axis=1) for place in other.layout.positions]
         apart = np.max(distances, axis=0) > APART
         return int(apart.argmax()) if apart.any() else length - 1
-
-
-def short_condition(condition: Any) -> str:
-    """Shorten a condition, for example to "gripper above and not left or right of puck"; only queries are shortened."""
-    if not isinstance(condition, Query):
-        return str(condition)
-    if condition.is_conjunction:
-        return _short_conjunction(condition.clauses) or str(condition)
-    return write(condition.expression, lambda clause, negated: _short_conjunction([replace(clause, negated=negated)]))
-
-
-def _short_conjunction(listed: Sequence[Clause]) -> str:
-    parts, last_subject = [], ""
-    # Consecutive clauses about the same two objects form one part; a clause without an object forms its own part.
-    numbered = [(c.subject, c.object, i if c.object is None else -1) for i, c in enumerate(listed)]
-    for (subject, target, _), pairs in groupby(zip(numbered, listed, strict=True), lambda pair: pair[0]):
-        clauses = [clause for _, clause in pairs]
-        words = ["" if subject == last_subject else subject.removeprefix("robot's ")]
-        last_subject, negated = subject, False
-        for i, clause in enumerate(clauses):
-            joint = ("or" if negated else "and not") if clause.negated else "but" if negated else "and"
-            first, *rest = clause.predicate.split()
-            keeps_preposition = clause is clauses[-1] or not rest or rest[-1] not in ("of", "with", "to")
-            if clause.predicate == TOUCHING:
-                words.append("off table" if clause.negated else "on table")
-            else:
-                words += [joint if i else "not" if clause.negated else "", first]
-                words += rest if keeps_preposition else rest[:-1]
-            negated = clause.negated
-        parts.append(" ".join(filter(None, [*words, target])))
-    return " and ".join(parts)
 
 
 def _reason(step: Any) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from lw_torchrl._util.text import markdown
 from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure
 from lw_torchrl.evaluation.diagnose.sentences import replaced_text
 from lw_torchrl.language.layout import Layout
+from lw_torchrl.language.outline import Line, outline
 from lw_torchrl.record.entities import FALSE, STEEL, Color, changes, rr, step_color
 from lw_torchrl.record.recorded_episode import NO_STEP, Ghost, RecordedEpisode
 
@@ -18,8 +20,9 @@ AFTER_SUCCESS, AROUND_FAILURE = 8, 60
 """The number of time steps to show after the first success, and before and after the time step at which a failure first
 shows."""
 LONGEST = 200  # maximum number of time steps to show from the ghost's divergence to the failure
-PLAN_LINES, LINE = 13, 78
-"""The maximum numbers of plan lines and of characters per line that leave room for the scene in a 1100×700 window."""
+LINE, MOST_LINES = 78, 2
+"""The number of characters per line in a 1100×700 window, and the maximum number of lines for a condition."""
+INDENT = "\u2003\u2003"
 SPARSE = 8  # outside the shown range, the scene is drawn every 8th time step (a tenth of a second)
 MARKS = {True: "✓", False: "✗", None: "·"}
 
@@ -180,47 +183,52 @@ def _step(episode: RecordedEpisode, step: int) -> str:
 def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
     """Log the plan to ``root``/plan as Markdown, for each time step in which a condition or the active step changes.
 
-    If the plan needs too many lines, conditions are shortened. Return the number of lines in a small window.
+    The steps are nested below the conditions that they share, and the branches above the active step are bold. Log the
+    conditions in full to ``root``/conditions. Return the number of lines of the plan in a small window.
     """
-    conditions = [condition for condition, _ in episode.steps]
-    if _line_count(conditions, episode) > PLAN_LINES:
-        conditions = list(episode.short_conditions)
     active = np.full(len(episode), NO_STEP) if episode.active is None else episode.active
     answers = [answers for answers in (episode.qaf, episode.believed) if answers is not None]
     rows = changes(np.concatenate([active[:, None], *answers], axis=1))
     confidence = [] if episode.confidence is None else [f"*confidence {episode.confidence:.2f}*"]
+    lines = _plan_lines(episode)
     texts = []
     for row in rows.tolist():
         parts = list(confidence)
         if episode.active is not None and episode.active[row] == NO_STEP:
             none = episode.answers is None or not episode.answers[row].any()
             parts.append(f"**{'No condition holds' if none else 'No step stands out'}: all steps mixed**")
-        for step, (_, skill) in enumerate(episode.steps):
-            truth = None if episode.qaf is None else bool(episode.qaf[row, step])
-            line = f"{MARKS[truth]}  {step + 1}.  if {markdown(conditions[step])}"
-            if episode.believed is not None and (believed := bool(episode.believed[row, step])) != truth:
-                line += f"  (evaluator: {MARKS[believed]})"
-            if active[row] == step:
-                reason = markdown(episode.reasons[step]) if episode.reasons else ""
-                parts += [
-                    f"**{line}**",
-                    f"\u2003\u2003**→ {markdown(skill)}**",
-                    *([f"\u2003*{reason}*"] if reason else []),
-                ]
-            else:
-                parts += [line, f"\u2003\u2003{markdown(skill)}"]
+        for line, text in lines:
+            step, is_active, indent = line.steps[0], active[row] in line.steps, INDENT * line.depth
+            if not line.head:
+                truth = None if episode.qaf is None else bool(episode.qaf[row, step])
+                text = f"{MARKS[truth]}  {'→ ' if is_active else ''}{text}"
+                if episode.believed is not None and (believed := bool(episode.believed[row, step])) != truth:
+                    text += f"  (evaluator: {MARKS[believed]})"
+            parts.append(f"{indent}**{text}**" if is_active else f"{indent}{text}")
+            reason = markdown(episode.reasons[step]) if episode.reasons and is_active and not line.head else ""
+            parts += [f"{indent}{INDENT}*{reason}*"] if reason else []
         texts.append("  \n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
     stream.send_columns(f"{root}/plan", episode.times(rows), documents)
-    return _line_count(conditions, episode)
+    full = "  \n".join(
+        f"{i}.  if {markdown(condition)}  \n{INDENT}{markdown(skill)}"
+        for i, (condition, skill) in enumerate(episode.steps, 1)
+    )
+    stream.log(f"{root}/conditions", rr.TextDocument(full, media_type=rr.MediaType.MARKDOWN), static=True)
+    reasons = [max(episode.reasons, key=len, default="")]
+    return sum(-(-len(text) // LINE) for text in [INDENT * line.depth + text for line, text in lines] + reasons)
 
 
-def _line_count(conditions: Sequence[str], episode: RecordedEpisode) -> int:
-    """Return the number of lines that the plan and the longest reason need in a small window."""
-    answer = "  (evaluator: x)" if episode.believed is not None else ""
-    texts = [f"x  1.  if {condition}{answer}" for condition in conditions] + [skill for _, skill in episode.steps]
-    texts += [max(episode.reasons, key=len, default="")]
-    return sum(-(-len(text) // LINE) for text in texts)
+def _plan_lines(episode: RecordedEpisode) -> list[tuple[Line, str]]:
+    """Return the lines of the plan's outline, each with its text; long conditions are shortened."""
+    skills = [f"{i}.  {markdown(skill)}" for i, (_, skill) in enumerate(episode.steps, 1)]
+    return [
+        (
+            line,
+            markdown(shorten(str(line), MOST_LINES * LINE, placeholder=" …")) if line.head else skills[line.steps[0]],
+        )
+        for line in outline(episode.guards)
+    ]
 
 
 def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:

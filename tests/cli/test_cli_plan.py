@@ -18,11 +18,8 @@ def test_prompt_equals_that_of_plan_prompt(capsys):
 
 
 def test_read_shows_how_each_step_was_parsed(capsys, tmp_path):
-    def rows(*arguments):
-        lines = run(capsys, "plan", "read", *arguments).splitlines()
-        return [re.split(r" {2,}", line) for line in lines[2:]]
-
-    (tmp_path / "coffee-pull.plan").write_text(
+    file = tmp_path / "coffee-pull.plan"
+    file.write_text(
         """def coffee_pull(robot):
     if check("the gripper is not above the mug"):
         robot.put("the gripper over a mug")
@@ -34,21 +31,71 @@ def test_read_shows_how_each_step_was_parsed(capsys, tmp_path):
         robot.be("careful")
 """
     )
-    steps = rows(tmp_path / "coffee-pull.plan")
-    assert {tuple(row[:2]) for row in steps} == {("coffee-pull", "completed, confidence 0.31")}
-    assert [row[2:4] for row in steps] == [
-        ["put the gripper over a mug", "place the gripper above the mug rim"],
-        ["grab it", "close the gripper around the mug rim"],
-        ["bring the mug to the goal", "carry the mug to the target location"],
-        ["(added)", "place the gripper above the mug rim"],
-        ["(added)", "lower the gripper around the mug rim"],
-        ["(added)", "close the gripper around the mug rim"],
-        ["bring the mug to the goal", "carry the mug to the target location"],
-        ["be careful", "(dropped: cannot be parsed)"],
+    title, heads, *lines = run(capsys, "plan", "read", file).rstrip().splitlines()
+    assert title == f"{file}: coffee-pull, completed, confidence 0.31"
+    assert heads.split() == ["plan", "verb", "object", "target", "confidence", "note"]
+    assert [re.split(r" {2,}", line.strip()) for line in lines] == [
+        ["if gripper not above mug"],
+        ["put the gripper over a mug", "approach", "robot's gripper", "mug rim", "1.0"],
+        ["if gripper near mug"],
+        ["grab it", "close", "robot's gripper", "mug rim", "1.0"],
+        ["bring the mug to the goal", "carry", "mug", "target location", "1.0"],
+        ["if gripper closed"],
+        ["be careful", "left out: no motion of an object is recognised"],
+        ["completed; policies on canonical plans see:"],
+        ["if gripper not near mug rim"],
+        ["if gripper not above mug rim"],
+        ["place the gripper above the mug rim", "approach", "robot's gripper", "mug rim"],
+        ["else"],
+        ["lower the gripper around the mug rim", "descend", "robot's gripper", "mug rim"],
+        ["else if gripper open"],
+        ["close the gripper around the mug rim", "close", "robot's gripper", "mug rim"],
+        ["if gripper near mug rim and closed"],
+        ["bring the mug to the goal", "carry", "mug", "target location", "1.0"],
     ]
-    assert [row[-1] == "yes" for row in steps] == [False] * 3 + [True] * 4 + [False]
-    assert len({row[0] for row in rows("MT50")}) == 50
-    assert {row[0] for row in rows("MT50", "--task", "soccer")} == {"soccer"}
+    steps = document(capsys, "plan read", file)["read"]
+    assert [step["seen"] for step in steps] == [False] * 4 + [True] * 4
+    assert steps[5]["path"] == ["if gripper not near mug rim", "else"]
+    assert run(capsys, "plan", "read", "MT50").count("confidence  note") == 50
+    assert run(capsys, "plan", "read", "MT50", "--task", "soccer").startswith("MT50: soccer, ")
+
+
+def test_read_prints_the_tree_of_a_program(capsys, tmp_path):
+    file = tmp_path / "push.py"
+    file.write_text(
+        """def push(robot):
+    attempts += 1
+    if check("the gripper is near the puck"):
+        if check("the gripper is closed"):
+            robot.push("the puck to the target location")
+        else:
+            robot.close("the gripper")
+    elif check("the puck is happy \x1b[31m and blue"):
+        robot.dance("wildly")
+    else:
+        robot.move("above the puck")
+"""
+    )
+    printed = run(capsys, "plan", "read", file)
+    tree = [re.split(r"(?<=\S) {2,}", line.rstrip())[0] for line in printed.splitlines()]
+    assert tree[2:9] == [
+        "if gripper near puck",
+        "  if gripper closed",
+        "    push the puck to the target location",
+        "  else",
+        "    close the gripper",
+        "else",
+        "  move above the puck",
+    ]
+    assert "left out: 'dance wildly': no query is near enough" in printed
+    assert "line 2: 'attempts += 1' is left out" in printed
+    assert "\x1b" not in printed
+    assert "happy \\x1b[31m" in printed
+    shown = document(capsys, "plan read", file)
+    paths = {step["written"]: (step["line"], step["path"]) for step in shown["read"] if step["written"]}
+    assert paths["close the gripper"] == (7, ["if gripper near puck", "else"])
+    assert paths["dance wildly"] == (9, [])
+    assert any("attempts += 1" in note for note in shown["plans"][0]["notes"])
 
 
 def test_plans_of_another_suite_are_read_and_checked(capsys, tmp_path):
@@ -73,7 +120,8 @@ def test_read_parses_answers_of_language_models(capsys, tmp_path, format):
     answer.parent.mkdir()
     answer.write_text(lw.encode_plan(plan, format))
     shown = document(capsys, "plan read", answer)
-    assert shown["plans"] == [{"task": "reach", "source": "plan", "confidence": 1.0}]
+    (summary,) = shown["plans"]
+    assert (summary["task"], summary["source"], summary["confidence"]) == ("reach", "plan", 1.0)
     assert [step["written"] for step in shown["read"]] == [step.skill for step in plan.steps]
     answer.with_name("push-0.txt").write_text("I cannot help with that.")
     printed = run(capsys, "plan", "read", *answer.parent.iterdir(), "--out", tmp_path / "mine")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from PIL import Image
 from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, record
 
 from lw_torchrl.language.objects import GRIPPER
+from lw_torchrl.language.outline import short_condition
 from lw_torchrl.language.queries import Clause, Query, parse_query
 from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.page import EVENLY, NONE_HOLDS
-from lw_torchrl.record.recorded_episode import NO_STEP, RecordedEpisode, short_condition
+from lw_torchrl.record.recorded_episode import NO_STEP, RecordedEpisode
 from lw_torchrl.record.scene import ROBOT_EYE, name_offsets
 from lw_torchrl.record.tabs import Tabs
 
@@ -64,12 +66,23 @@ def test_the_plan_follows_the_cursor(tmp_path):
     qaf = rollout["qaf"][:, :2].tolist()
     # There is a text at each change, and nowhere else.
     assert steps == [t for t in range(20) if t == 0 or qaf[t] != qaf[t - 1]]
-    (first, first_skill), (second, second_skill) = STEPS
-    assert f"**✓  1.  if {first}**" in texts[0]
-    assert f"**→ {first_skill}**" in texts[0]
-    assert f"\n✗  2.  if {second}  \n\u2003\u2003{second_skill}" in texts[0]
-    assert f"✗  1.  if {first}" in texts[1]
-    assert f"**→ {second_skill}**" in texts[1]
+    head, indent = f"if {short_condition(PLAN.steps[0].condition)}", "\u2003\u2003"
+    first, second = (f"{i}.  {skill}" for i, (_, skill) in enumerate(STEPS, 1))
+    # The active step and the branches above it are bold.
+    assert texts[0].split("  \n") == [f"**{head}**", f"{indent}**✓  → {first}**", "else", f"{indent}✗  {second}"]
+    assert texts[1].split("  \n") == [head, f"{indent}✗  {first}", "**else**", f"{indent}**✓  → {second}**"]
+    (full,) = recording.values("/push/conditions", "TextDocument:text")[0]
+    assert full.startswith(f"1.  if {STEPS[0][0]}  \n{indent}{STEPS[0][1]}")
+
+
+def test_a_long_condition_is_shortened(tmp_path):
+    condition = "the puck looks as if it could be moved " * 20
+    plan = SimpleNamespace(steps=[SimpleNamespace(condition=condition, skill="move the puck")])
+    recording = record(tmp_path / "a.rrd", make_rollout().exclude("qaf", "skill_weights"), plan=plan)
+    (text,) = recording.values("/push/plan", "TextDocument:text")[0]
+    assert text.startswith("if the puck looks as if")
+    assert text.splitlines()[0].endswith(" …  ")
+    assert recording.values("/push/conditions", "TextDocument:text")[0][0].startswith(f"1.  if {condition}")
 
 
 def test_the_active_step_has_a_lane(tmp_path):
