@@ -118,12 +118,8 @@ class QAFTransform(KeepsEnvState):
         tables = PlanTables(self.plans)
         self._number = TaskTables(tables.index, _Number(tables.number), f"tasks without a plan in {self.plans!r}")
         self._task: Tensor | None = None  # the task of each row since its last reset
-        self._latches: Tensor | None = None  # (B, L) bool, the latches of the last step
         if self.program.num_latches:
             self.out_keys = [*self.out_keys, latches_key(truth[0])]
-
-    def _forget_episodes(self) -> None:
-        self._latches = None
 
     def with_plans(self, plans: AnyPlans) -> QAFTransform:
         """Return a transform that answers the conditions of different plans."""
@@ -150,32 +146,29 @@ class QAFTransform(KeepsEnvState):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         before = None
         if self.program.num_latches:
-            before = tensordict.get(self.out_keys[2], self._latches)
+            before = tensordict.get(self.out_keys[2], None)
             if before is None:
-                raise ValueError(f"a step requires {self.out_keys[2]!r}, the latches before it: reset the environment")
+                raise ValueError(f"a step requires {self.out_keys[2]!r}, the latches before it, which a reset writes")
         self._write(next_tensordict, next_tensordict.get(self.in_keys[1], None), before)
-        self._keep_latches(next_tensordict)
         return next_tensordict
-
-    def _keep_latches(self, tensordict: TensorDictBase) -> None:
-        if self.program.num_latches:
-            self._latches = tensordict.get(self.out_keys[2]).clone()  # a collector writes into the tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         begun, task = tensordict.get("_reset", None), tensordict_reset.get(self.in_keys[1], None)
         self._task = task if task is None else reset_rows(self._task, task, begun)
         self._write(tensordict_reset, self._task, self._cleared(tensordict, tensordict_reset, begun))
-        self._keep_latches(tensordict_reset)
         return tensordict_reset
 
     def _cleared(self, tensordict: TensorDictBase, fresh: TensorDictBase, begun: Tensor | None) -> Tensor | None:
-        """Return the latches of all rows, false in the rows that are reset."""
+        """Return the latches of all rows, false in the rows that are reset.
+
+        If TorchRL passes no latches, it restores those of the other rows itself.
+        """
         if not self.program.num_latches:
             return None
         observation = fresh.get(self.in_keys[0])
         shape = (*observation.shape[:-1], self.program.num_latches)
         none = torch.zeros(shape, dtype=torch.bool, device=observation.device)
-        return reset_rows(tensordict.get(self.out_keys[2], self._latches), none, begun, 1)
+        return reset_rows(tensordict.get(self.out_keys[2], None), none, begun, 1)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation, task = self.in_keys

@@ -15,6 +15,7 @@ from torchrl.envs.utils import check_env_specs
 import lw_torchrl as lw
 from lw_torchrl.language import query_program
 from lw_torchrl.language.expressions import Expression, Once, all_of, any_of, evaluate, fold, leaves, negate, once
+from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.queries import Clause, Query, parse_query
 from lw_torchrl.language.query_program import QueryProgram
 
@@ -211,10 +212,9 @@ def test_a_reset_by_hand_clears_only_the_latches_of_its_rows(few_latches):
     before = state["qaf_latches"]
     assert before[is_push].float().mean() > 0.3
     assert not before[~is_push].any()
-    for given in (state.clone(), TensorDict(batch_size=[ROWS])):  # TorchRL's automatic resets may pass no other keys
-        after = env.reset(given.set("_reset", mask))["qaf_latches"]
-        assert torch.equal(after[~mask.flatten()], before[~mask.flatten()])
-    program = QueryProgram({"push": [CLAUSES["push"][0].__str__()], "reach": ["never"]})
+    after = env.reset(state.clone().set("_reset", mask))["qaf_latches"]
+    assert torch.equal(after[~mask.flatten()], before[~mask.flatten()])
+    program = QueryProgram({"push": [str(CLAUSES["push"][0])], "reach": ["never"]})
     fresh = env.reset(state.clone().set("_reset", mask))
     near = program(fresh["observation"], fresh["task_id"]).flatten()
     assert torch.equal(fresh["qaf_latches"][mask.flatten(), 0], near[mask.flatten()])
@@ -254,10 +254,10 @@ def test_what_has_no_history_is_refused(few_latches):
     with pytest.raises(ValueError, match="latches must be bool of shape"):
         program(observation, ids, torch.zeros(2, 3))
     rows = TensorDict(observation=observation, task_id=ids, batch_size=[2])
-    with pytest.raises(ValueError, match="rows have no 'qaf_latches'.*LanguageWorldExperienceReplay"):
+    with pytest.raises(ValueError, match=r"rows have no 'qaf_latches'.*LanguageWorldExperienceReplay"):
         lw.QAFTransform(few_latches)(rows)
-    with pytest.raises(ValueError, match="learned evaluator.*push depend on earlier steps"):
-        lw.modules.QueryEvaluator(few_latches)
+    with pytest.raises(ValueError, match=r"learned evaluator.*push depend on earlier steps"):
+        lw.modules.StateQueryEvaluator(few_latches)
 
 
 def test_soft_truth_has_the_sign_of_the_exact_truth_and_finite_gradients():
@@ -321,4 +321,20 @@ def test_without_memory_a_latch_is_its_condition():
     truth = {leaf: leaf.predicate == "open" for leaf in leaves(query.expression)}
     assert evaluate(query.expression, truth) == evaluate(query.present.expression, truth)
     with pytest.raises(lw.PlanError, match="a goal is a state"):
-        lw.ConditionalPlan("push", (lw.PlanStep(query, "open the gripper", goal=query),))
+        lw.ConditionalPlan("push", (PlanStep(query, "open the gripper", goal=query),))
+
+
+def test_evaluate_runs_a_plan_that_latches():
+    pairs = [
+        ("once (the gripper is near the reach target)", "move the gripper to the reach target"),
+        ("not once (the gripper is near the reach target)", "move the gripper to the reach target"),
+    ]
+    plans = lw.Plans([lw.ConditionalPlan.from_pairs("reach", pairs)])
+    actor, done = lw.ScriptedSkillActor(plans), ("next", "qaf")
+    result = lw.evaluate(actor, tasks="reach", episodes_per_task=3, seed=5, max_steps=60, num_envs=2)
+    assert result.success_once == {"reach": 1.0}
+    env = TransformedEnv(lw.LanguageWorldEnv("reach", num_envs=3, max_steps=25), lw.QAFTransform(plans))
+    check_env_specs(env)
+    first = env.rollout(60, actor, break_when_any_done=False)
+    assert first[done].any()
+    assert check_rollout(first, plans) == 9
