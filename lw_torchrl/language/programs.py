@@ -314,12 +314,11 @@ class _Compiler:
             falls = all_of([falls, flow.falls])
         return _Flow(falls, all_of([hard, soft]), any_of(fails), jumps)
 
-
     def remembered(self, node: Sequence, here: Expression, depth: int) -> _Flow:
         done, falls, fails = TRUE, TRUE, list[Expression]()
         for part in node.parts:
             begin = len(self.steps)
-            flow = self.run(part, all_of([here, done]), False, depth)
+            flow = self.run(part, all_of([here, done]), not isinstance(part, Action), depth)
             before, done = done, once(all_of([here, done, flow.settles]))
             fails.append(all_of([before, negate(done), flow.fails]))
             falls = all_of([falls, flow.falls])

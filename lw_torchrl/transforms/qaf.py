@@ -111,15 +111,15 @@ class QAFTransform(KeepsEnvState):
     def __init__(self, plans: AnyPlans, *, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:
         truth = as_keys("out_keys", out_keys, ("qaf",))
         keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
-        super().__init__(in_keys=keys, out_keys=[*truth, plan_number_key(truth[0])])
+        plans = as_plans(plans)
+        program = plan_program(plans)
+        latches = [latches_key(truth[0])] if program.num_latches else []
+        super().__init__(in_keys=keys, out_keys=[*truth, plan_number_key(truth[0]), *latches])
         check_apart(self.in_keys, self.out_keys)
-        self.plans = as_plans(plans)
-        self.program = plan_program(self.plans)
+        self.plans, self.program = plans, program
         tables = PlanTables(self.plans)
         self._number = TaskTables(tables.index, _Number(tables.number), f"tasks without a plan in {self.plans!r}")
         self._task: Tensor | None = None  # the task of each row since its last reset
-        if self.program.num_latches:
-            self.out_keys = [*self.out_keys, latches_key(truth[0])]
 
     def with_plans(self, plans: AnyPlans) -> QAFTransform:
         """Return a transform that answers the conditions of different plans."""
