@@ -13,7 +13,7 @@ from rapidfuzz import fuzz, process
 
 from lw_torchrl._util.checks import check_choice, typed
 from lw_torchrl.language.connectives import parse_words
-from lw_torchrl.language.expressions import Expression, negate, once
+from lw_torchrl.language.expressions import Expression
 from lw_torchrl.language.objects import GRIPPER, WORDS
 from lw_torchrl.language.queries import (
     Clause,
@@ -21,7 +21,6 @@ from lw_torchrl.language.queries import (
     QueryError,
     base_clauses,
     read_query,
-    split_perfect,
     split_words,
 )
 from lw_torchrl.language.relations import PREDICATES
@@ -149,12 +148,6 @@ def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
     """Match one part of a text to the nearest base query or negated base query."""
     if (query := read_query(part, task)) is not None:
         return QueryPart(part, query, 1.0)
-    present, is_latch, denied = split_perfect(part)
-    if is_latch:
-        nearest = _nearest_part(present, task, by)
-        (clause,) = nearest.query.clauses
-        latch = once(replace(clause, negated=False))
-        return QueryPart(part, Query(negate(latch) if clause.negated != denied else latch), nearest.score)
     words, negated = _affirmed(part)
     clauses, contents = _choices(task, tuple(PREDICATES))
     if by == "edit":

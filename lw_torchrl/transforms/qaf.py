@@ -163,9 +163,9 @@ class QAFTransform(KeepsEnvState):
 
         If TorchRL passes no latches, it restores those of the other rows itself.
         """
-        if not self.program.num_latches:
+        observation = fresh.get(self.in_keys[0], None)
+        if not self.program.num_latches or observation is None:
             return None
-        observation = fresh.get(self.in_keys[0])
         shape = (*observation.shape[:-1], self.program.num_latches)
         none = torch.zeros(shape, dtype=torch.bool, device=observation.device)
         return reset_rows(tensordict.get(self.out_keys[2], None), none, begun, 1)
