@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from torch import Tensor
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 from torchrl.data import ImmutableDatasetWriter, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
@@ -22,11 +22,12 @@ from lw_torchrl._util.checks import Count, Natural, Probability, typed
 from lw_torchrl._util.devices import CPU, finite
 from lw_torchrl._util.files import AnyPath, reading
 from lw_torchrl._util.tensor_files import pop_state, read_tensors, write_tensors
-from lw_torchrl.data.dataset import DATA, read_metadata, verify
+from lw_torchrl.data.dataset import DATA, TRAJECTORY, read_metadata, verify
 from lw_torchrl.data.loading import check_options, labels_of, read_rows
-from lw_torchrl.data.rewards import RewardName
+from lw_torchrl.data.rewards import STEPS, RewardName
 from lw_torchrl.data.samplers import to_device_of
 from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label, select
+from lw_torchrl.transforms.qaf import QAFTransform, latches_of_rows
 
 _FILE = "buffer.safetensors"
 _OVER_TIME = {  # TorchRL's transforms that read several time steps of an episode; not all versions have all
@@ -61,7 +62,7 @@ class DatasetStorage(TensorStorage):
         rows: TensorDict = super().get(index)
         return rows if isinstance(index, Tensor) and index.dim() else rows.clone(recurse=not isinstance(index, slice))
 
-    def add_column(self, name: str, values: Tensor) -> None:
+    def add_column(self, name: NestedKey, values: Tensor) -> None:
         """Add a column with one value (R, ...) per row."""
         self._storage.set(name, values)
 
@@ -191,6 +192,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         kwargs |= {"sampler": sampler, "batch_size": batch_size, "transform": transform}
         super().__init__(storage=storage, writer=ImmutableDatasetWriter(), **kwargs)
         _check_time(self.sampler, self.transform)
+        self._add_latches(self.transform)
 
     def sample(self, batch_size: int | None = None, return_info: bool = False, include_info: bool | None = None) -> Any:
         """Draw a minibatch; see :meth:`torchrl.data.TensorDictReplayBuffer.sample`."""
@@ -198,6 +200,35 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         if self._plain:
             rows = rows.exclude(*info)
         return (rows, info) if return_info else rows
+
+    def append_transform(self, transform: Transform, *, invert: bool = False) -> Any:
+        """Append a transform; a :class:`QAFTransform` whose plans have latches adds their column to the rows."""
+        _check_time(self.sampler, self.transform, transform)
+        self._add_latches(transform)
+        return super().append_transform(transform, invert=invert)
+
+    def insert_transform(self, index: int, transform: Transform, *, invert: bool = False) -> Any:
+        """Insert a transform, like :meth:`append_transform`."""
+        _check_time(self.sampler, *self.transform[:index], transform)
+        self._add_latches(transform)
+        return super().insert_transform(index, transform, invert=invert)
+
+    def _add_latches(self, transform: Any) -> None:
+        """Compute the latches of each QAFTransform in all rows, since a sample does not show the earlier steps."""
+        for part in transform.modules() if isinstance(transform, nn.Module) else ():
+            if isinstance(part, QAFTransform) and part.program.num_latches:
+                self._compute_latches(part)
+
+    def _compute_latches(self, part: QAFTransform) -> None:
+        rows, (seen, task), key = self.storage[:], part.in_keys, part.out_keys[2]
+        if (trajectory := rows.get(TRAJECTORY, None)) is None:
+            raise ValueError(f"keys must contain {TRAJECTORY!r}, since the plans' conditions depend on earlier steps")
+        latches = latches_of_rows(part.program, rows.get(seen), rows.get(task), trajectory)
+        self.storage.add_column(key, latches)
+        if (following := rows.get(("next", seen), None)) is not None:
+            last = torch.arange(len(rows), device=latches.device) + rows.get(STEPS, 1) - 1
+            after = part.program.remember(following, rows.get(("next", task), rows.get(task)), latches[last])[1]
+            self.storage.add_column(unravel_key(("next", key)), after)
 
     def set_sampler(self, sampler: Sampler) -> Sampler:
         """Set a sampler, which uses the buffer's generator; in a DataLoader worker, call ``set_rng`` afterwards."""
@@ -207,16 +238,6 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         if get_worker_info() is None:
             self.set_rng(self._rng)
         return before
-
-    def append_transform(self, transform: Transform, **kwargs: Any) -> Any:
-        """Append a transform; see :meth:`torchrl.data.ReplayBuffer.append_transform`."""
-        _check_time(self.sampler, self.transform, transform)
-        return super().append_transform(transform, **kwargs)
-
-    def insert_transform(self, index: int, transform: Transform, **kwargs: Any) -> Any:
-        """Insert a transform; see :meth:`torchrl.data.ReplayBuffer.insert_transform`."""
-        _check_time(self.sampler, *self.transform[:index], transform)
-        return super().insert_transform(index, transform, **kwargs)
 
     def add_column(self, name: str, values: Tensor, *, of: LanguageWorldExperienceReplay | None = None) -> None:
         """Add a column ``name`` to the samples, for example the advantage of each row; the values are kept in memory.

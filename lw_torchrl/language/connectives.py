@@ -1,11 +1,11 @@
-"""The words that join conditions: "and", "or", "unless", "either ... or", "neither ... nor", and parentheses."""
+"""The words that join conditions: "and", "or", "unless", "either ... or", "neither ... nor", "once" and parentheses."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from lw_torchrl.language.expressions import Expression, all_of, any_of, negate
+from lw_torchrl.language.expressions import Expression, all_of, any_of, negate, once
 
 CONNECTIVES = ("and", "or", "nor", "unless", "either", "neither", "both")
 """The words that join conditions, which no name of an object or a relation may contain."""
@@ -19,6 +19,8 @@ class _Group:
 
     opener: str
     negated: bool
+    is_latch: bool = False  # "once (...)"
+    negated_inside: bool = False  # "once not (...)"
     parts: list[Expression] = field(default_factory=list)  # joined by "and"
     alternatives: list[Expression] = field(default_factory=list)  # joined by "or"
     exceptions: list[Expression] = field(default_factory=list)  # a condition, and those after "unless"
@@ -42,7 +44,9 @@ class _Group:
         if not self.exceptions:
             return None
         first, *others = self.exceptions
-        return all_of([first, *map(negate, others)])
+        condition = all_of([first, *map(negate, others)])
+        condition = negate(condition) if self.negated_inside else condition
+        return once(condition) if self.is_latch else condition
 
 
 # The groups that a word ends; a parenthesis and the end of the text end all but "(".
@@ -54,7 +58,7 @@ def parse_words(
     operand: Callable[[list[str]], Expression | None],
     fail: Callable[[int, str], Exception],
 ) -> Expression | None:
-    """Parse a condition in English: "A or B", "not (A and B)", "neither A nor B", "either A or B", "A unless B".
+    """Parse a condition in English: "A or B", "not (A and B)", "neither A nor B", "A unless B", "once (A and B)".
 
     "and" binds tighter than "or", and "unless" binds loosest. The words before a parenthesis, "either", "both" or
     "neither" belong to the first operand in it: "the gripper is (open or closed)".
@@ -72,10 +76,19 @@ def parse_words(
             raise fail(number, "'and', 'or' or the end of the condition")
         if opens:
             # In "the gripper is not (A or B)", "not" negates the group, and "the gripper is" begins A.
+            before = [each.casefold() for each in pending]
+            is_latch = "once" in before and {*before} <= {"not", "once"}
+            outside = before[: before.index("once")] if is_latch else before
             for denied in ("not", "isn't"):
-                negated ^= [each.casefold() for each in pending].count(denied) % 2 == 1
-            pending = ["is" if each.casefold() == "isn't" else each for each in pending if each.casefold() != "not"]
-            stack.append(_Group(word, negated != (word == "neither")))
+                negated ^= outside.count(denied) % 2 == 1
+            pending = [
+                "is" if lower == "isn't" else each
+                for lower, each in zip(before, pending, strict=True)
+                if lower != "not" and not is_latch
+            ]
+            is_neither = word == "neither"
+            inside = is_latch and (is_neither != (len(before) - len(outside) == 2))  # "once not (A)"
+            stack.append(_Group(word, negated != (is_neither and not is_latch), is_latch, inside))
             negated = False
         elif word not in ("", ")", *CONNECTIVES):
             pending.append(given)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from threading import Lock
 from typing import Any, Literal, NamedTuple, TypeVar
 from weakref import WeakValueDictionary
@@ -153,6 +155,46 @@ FALSE = negate(TRUE)
 """The expression that is never true."""
 
 
+@dataclass(frozen=True)
+class Once:
+    """A leaf that remembers: true from the first step of an episode in which ``condition`` was true.
+
+    The condition may contain other latches. :func:`once` makes latches in normal form.
+    """
+
+    condition: Expression
+
+    def __str__(self) -> str:
+        return f"once ({self.condition})"
+
+    @cached_property  # a latch may be mentioned by several others, which would be visited repeatedly
+    def literals(self) -> tuple[Expression, ...]:
+        """The distinct leaves and negated leaves of the condition, without latches."""
+        return literals(self.condition)
+
+    @cached_property
+    def mentions(self) -> int:
+        """How often the written condition mentions a leaf."""
+        return count_mentions(self.condition)
+
+
+def once(condition: Any) -> Expression:
+    """Return a latch of an expression or leaf (:class:`Once`).
+
+    Example:
+        >>> print(once(all_of(["near", once("held")])))
+        once (near and once (held))
+    """
+    expression = as_expression(condition)
+    is_latch = expression.kind == "leaf" and not expression.negated and isinstance(expression.leaf, Once)
+    return expression if is_latch or expression in (TRUE, FALSE) else as_expression(Once(expression))
+
+
+def has_latch(expression: Expression) -> bool:
+    """Return whether an expression contains a latch."""
+    return fold(expression, lambda each, parts: isinstance(each.leaf, Once) if each.kind == "leaf" else any(parts))
+
+
 def fold(expression: Expression, visit: Callable[[Expression, list[Result]], Result]) -> Result:
     """Compute a result bottom-up: call ``visit(part, results of its parts)`` once for each distinct part."""
     results: dict[Expression, Result] = {}
@@ -169,35 +211,49 @@ def fold(expression: Expression, visit: Callable[[Expression, list[Result]], Res
 
 
 def evaluate(expression: Expression, truth: Mapping[Any, bool]) -> bool:
-    """Return the truth of an expression, given the truth of its leaves."""
+    """Return the truth of an expression, given the truth of its leaves.
+
+    A latch has the truth of its condition, as in the first step of an episode.
+    """
 
     def visit(each: Expression, parts: list[bool]) -> bool:
         if each.kind == "leaf":
-            return bool(truth[each.leaf]) != each.negated
+            leaf = each.leaf
+            return bool(fold(leaf.condition, visit) if isinstance(leaf, Once) else truth[leaf]) != each.negated
         return all(parts) if each.kind == "all" else any(parts)
 
     return fold(expression, visit)
 
 
 def replace_leaves(expression: Expression, function: Callable[[Any], Any]) -> Expression:
-    """Replace each leaf with ``function(leaf)``, an expression or a leaf; the function is called once for each leaf."""
-    replaced = {leaf: as_expression(function(leaf)) for leaf in leaves(expression)}
+    """Replace each leaf with ``function(leaf)``, an expression or a leaf; the function is called once for each leaf.
+
+    In a latch, the leaves of the condition are replaced.
+    """
+    replaced: dict[Any, Expression] = {}
 
     def visit(each: Expression, parts: list[Expression]) -> Expression:
         if each.kind == "leaf":
-            return negate(replaced[each.leaf]) if each.negated else replaced[each.leaf]
+            leaf = each.leaf
+            if leaf not in replaced:
+                is_latch = isinstance(leaf, Once)
+                replaced[leaf] = once(fold(leaf.condition, visit)) if is_latch else as_expression(function(leaf))
+            return negate(replaced[leaf]) if each.negated else replaced[leaf]
         return all_of(parts) if each.kind == "all" else any_of(parts)
 
     return fold(expression, visit)
 
 
 def literals(expression: Expression) -> tuple[Expression, ...]:
-    """Return the distinct leaves and negated leaves, in the order of their first mention."""
-    found: list[Expression] = []
+    """Return the distinct leaves and negated leaves, in the order of their first mention.
+
+    A latch is not a leaf here; the leaves of its condition are.
+    """
+    found: dict[Expression, None] = {}
 
     def visit(each: Expression, _: list[None]) -> None:
         if each.kind == "leaf":
-            found.append(each)
+            found.update(dict.fromkeys(each.leaf.literals if isinstance(each.leaf, Once) else (each,)))
 
     fold(expression, visit)
     return tuple(found)
@@ -229,7 +285,13 @@ def implied(expression: Expression) -> tuple[Expression, ...]:
 
 def count_mentions(expression: Expression) -> int:
     """Return how often the written expression mentions a leaf, without writing the expression."""
-    return fold(expression, lambda each, parts: sum(parts) if each.kind != "leaf" else 1)
+
+    def visit(each: Expression, parts: list[int]) -> int:
+        if each.kind != "leaf":
+            return sum(parts)
+        return each.leaf.mentions if isinstance(each.leaf, Once) else 1
+
+    return fold(expression, visit)
 
 
 def write(expression: Expression, literal: Callable[[Any, bool], str]) -> str:

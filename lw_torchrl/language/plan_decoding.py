@@ -266,6 +266,7 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
     else:
         condition, distance, unknown = _mapped_guard(clause, mapper, notes)
     goal, goal_distance, exact_goal = mapper.query(clause.goal) if clause.goal else MappedQuery(None, 0.0)
+    goal = None if goal is None else goal.present
     dropped = ""
     try:
         words = canonical_skill(clause.skill, mapper.task)

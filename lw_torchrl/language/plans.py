@@ -112,6 +112,8 @@ class ConditionalPlan:
             try:
                 condition, skill = check_query(step.condition, task), canonical_skill(step.skill, task)
                 goal = None if step.goal is None else check_query(step.goal, task)
+                if goal is not None and goal.has_latch:
+                    raise PlanError(f"a goal is a state, without 'has been' and 'once'; use {str(goal.present)!r}")
                 for name in () if step.role is None else step.role.objects:
                     role_object(task, name)
             except ValueError as error:

@@ -6,10 +6,10 @@ The readers of :mod:`lw_torchrl.language.formats` build trees from Python, JSON,
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
-from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, leaves, negate
+from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, leaves, negate, once
 
 MOST_DEPTH = 60  # maximum nesting of a program, without counting ``elif``
 _BREAK = "break"
@@ -46,9 +46,13 @@ class Branch:
 
 @dataclass(frozen=True)
 class Sequence:
-    """Programs in turn: each waits until the previous ones succeed, and fails if one of them fails."""
+    """Programs in turn: each waits until the previous ones succeed, and fails if one of them fails.
+
+    With ``memory``, a program that has succeeded while it was active is not run again in the episode.
+    """
 
     parts: tuple[Node, ...] = ()
+    memory: bool = False
 
 
 @dataclass(frozen=True)
@@ -226,6 +230,8 @@ class _Compiler:
             return self.loop(node, here, depth + 1)
         if isinstance(node, Selector):
             return self.selector(node, here, followed, depth + 1)
+        if isinstance(node, Sequence) and node.memory:
+            return self.remembered(node, here, depth + 1)
         if isinstance(node, Sequence | Block):
             return self.sequence(node, here, followed, depth + 1)
         return _Flow()
@@ -308,10 +314,24 @@ class _Compiler:
             falls = all_of([falls, flow.falls])
         return _Flow(falls, all_of([hard, soft]), any_of(fails), jumps)
 
+    def remembered(self, node: Sequence, here: Expression, depth: int) -> _Flow:
+        done, falls, fails = TRUE, TRUE, list[Expression]()
+        for part in node.parts:
+            begin = len(self.steps)
+            flow = self.run(part, all_of([here, done]), not isinstance(part, Action), depth)
+            before, done = done, once(all_of([here, done, flow.settles]))
+            fails.append(all_of([before, negate(done), flow.fails]))
+            falls = all_of([falls, flow.falls])
+            if flow.settles != TRUE:  # an action whose effect has no name stays active
+                for number, step in enumerate(self.steps[begin:], begin):
+                    self.steps[number] = replace(step, guard=all_of([step.guard, negate(done)]))
+        return _Flow(falls, done, any_of(fails))
+
 
 def _inlined(node: Sequence | Block) -> list[Node]:
     """Return the parts of a sequence, with those of sequences in it."""
     parts = list[Node]()
     for part in node.parts:
-        parts += _inlined(part) if type(part) is type(node) else [part]
+        is_same = type(part) is type(node) and not (isinstance(part, Sequence) and part.memory)
+        parts += _inlined(part) if is_same else [part]  # type: ignore[arg-type]
     return parts

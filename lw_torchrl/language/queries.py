@@ -17,13 +17,18 @@ from lw_torchrl.language.expressions import (
     FALSE,
     TRUE,
     Expression,
+    Once,
     all_of,
+    any_of,
     as_expression,
     count_mentions,
+    fold,
+    has_latch,
     implied,
     leaves,
     literals,
     negate,
+    once,
     replace_leaves,
     write,
 )
@@ -36,6 +41,10 @@ ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
 _OTHERS = frozenset(("(", *CONNECTIVES)) - {"and"}
 MOST_CLAUSES = 256  # in the text of a query
+_PERFECT = re.compile(
+    r"\b(?:(?:has|have|had)|(?:was|were)(?= (?:not |never )?(?:once|ever)\b))(n't\b| not\b| never\b)?"
+    r"(?: (?:once|ever|already|yet|just|before)\b)*(?: been\b)?"
+)
 
 
 @dataclass(frozen=True)
@@ -68,6 +77,8 @@ class Query:
         "the robot's gripper is open and the robot's gripper is not above the puck"
         >>> print(parse_query("either the gripper is open or the puck is not near the target location", task="push"))
         the robot's gripper is open or the puck is not near the target location
+        >>> print(parse_query("the gripper has been near the puck", task="push"))  # a latch: true from then on
+        the robot's gripper has been near the puck
     """
 
     expression: Expression
@@ -84,14 +95,26 @@ class Query:
     def __str__(self) -> str:
         if self._given:
             return " and ".join(map(str, self._given))
-        return write(self.expression, lambda clause, negated: str(replace(clause, negated=negated)))
+        return write(self.expression, _write_literal)
 
     @property
     def is_conjunction(self) -> bool:
-        """True for a clause or a conjunction of clauses: a query without "or"."""
+        """True for a clause or a conjunction of clauses: a query without "or" and without latches."""
         if self._given:
             return True
+        if self.has_latch:
+            return False
         return self.expression.kind != "any" and all(part.kind == "leaf" for part in self.expression.parts)
+
+    @cached_property
+    def has_latch(self) -> bool:
+        """Whether the query depends on earlier steps of the episode ("has been", "once (...)")."""
+        return has_latch(self.expression)
+
+    @property
+    def present(self) -> Query:
+        """The query without memory: each latch is replaced by its condition."""
+        return Query(_present(self.expression)) if self.has_latch else self
 
     @cached_property
     def clauses(self) -> tuple[Clause, ...]:
@@ -101,11 +124,49 @@ class Query:
     @cached_property
     def implied(self) -> tuple[Clause, ...]:
         """The clauses that are true wherever the query is true, as far as its form shows."""
-        return self._given or tuple(map(_as_clause, implied(self.expression)))
+        found = [literal for literal in implied(self.expression) if not isinstance(literal.leaf, Once)]
+        return self._given or tuple(map(_as_clause, found))
 
 
 def _without_negation(clause: Clause) -> Expression:
     return negate(replace(clause, negated=False)) if clause.negated else as_expression(clause)
+
+
+def _present(expression: Expression) -> Expression:
+    def visit(each: Expression, parts: list[Expression]) -> Expression:
+        if each.kind != "leaf":
+            return all_of(parts) if each.kind == "all" else any_of(parts)
+        if not isinstance(each.leaf, Once):
+            return each
+        return negate(_present(each.leaf.condition)) if each.negated else _present(each.leaf.condition)
+
+    return fold(expression, visit)
+
+
+def _write_literal(leaf: Clause | Once, negated: bool) -> str:
+    """Write a clause or a latch: "the puck has been near the goal" for a clause, otherwise "once (...)"."""
+    if isinstance(leaf, Clause):
+        return str(replace(leaf, negated=negated))
+    condition = leaf.condition
+    if condition.kind == "leaf" and not condition.negated and isinstance(condition.leaf, Clause):
+        clause = condition.leaf
+        words = f"the {clause.subject} has {'not ' if negated else ''}been {clause.predicate}"
+        return words if clause.object is None else f"{words} the {clause.object}"
+    return f"{'not ' if negated else ''}once ({write(condition, _write_literal)})"
+
+
+def split_perfect(text: str) -> tuple[str, bool, bool]:
+    """Return a clause in the present tense, whether it was in the perfect tense, and whether that was negated.
+
+    Example:
+        >>> split_perfect("the gripper has not been near the puck")
+        ('the gripper is near the puck', True, True)
+    """
+    match = _PERFECT.search(text)
+    if match is None or not match[0].endswith(("been", "once", "ever")):
+        return text, False, False
+    before = re.sub(r"^(?:once|after|since) ", "", text[: match.start()])
+    return f"{before}is{text[match.end() :]}", True, match[1] is not None
 
 
 def _as_clause(literal: Expression) -> Clause:
@@ -276,6 +337,9 @@ def parse_query(text: str, task: str | Task) -> Query:
     parentheses to any depth. "and" binds tighter than "or", and "unless" binds loosest. "always" is a condition that is
     always true, "never" one that is never true.
 
+    A latch is true from the first step of an episode in which a condition was true: "the gripper has been near the
+    puck", "once (the gripper is near the puck and closed)". Its condition may contain latches.
+
     Args:
         text: a condition of at most 256 clauses, such as "Is the gripper open and not above the puck?".
 
@@ -303,20 +367,26 @@ def _parse(text: str, task: Task, explain: bool) -> Query:
     words = split_words(text.replace("’", "'").casefold().strip().strip(" ?.!"))
     clauses: list[Clause] = []
 
-    def clause(operand: list[str]) -> Expression:
+    def operand_of(operand: list[str]) -> Expression:
         if operand in (["always"], ["never"]):
             return TRUE if operand == ["always"] else FALSE
-        clauses.append(_ClauseParser(operand, task, text, explain).parse(clauses[-1].subject if clauses else None))
-        return _without_negation(clauses[-1])
+        present, is_latch, is_negated = split_perfect(" ".join(operand))
+        words = present.split() if is_latch else operand
+        clause = _ClauseParser(words, task, text, explain).parse(clauses[-1].subject if clauses else None)
+        clauses.append(clause)
+        if not is_latch:
+            return _without_negation(clause)
+        latch = once(replace(clause, negated=False))
+        return negate(latch) if clause.negated != is_negated else latch
 
     def fail(number: int, expected: str) -> QueryError:
         parser = _ClauseParser(words, task, text, explain)
         parser.at = number
         return parser.error(expected)
 
-    expression = parse_words(words, clause, fail)
+    expression = parse_words(words, operand_of, fail)
     assert expression is not None  # every operand is a clause or an error
-    is_plain = len(clauses) == 1 + words.count("and") and not _OTHERS.intersection(words)
+    is_plain = len(clauses) == 1 + words.count("and") and not _OTHERS.intersection(words) and not has_latch(expression)
     return Query(tuple(clauses) if is_plain else expression)
 
 

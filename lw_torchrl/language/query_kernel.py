@@ -9,13 +9,14 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def answer(
-    observation: Any, task_id: Any, ids: Any, row_of: Any, ends: Any, places: Any, metres: Any, bit: Any, flipped: Any,
-    gates: Any, care: Any, want: Any, constants: Any, truth: Any,
+    observation: Any, task_id: Any, latches: Any, ids: Any, row_of: Any, ends: Any, places: Any, metres: Any, bit: Any,
+    flipped: Any, gates: Any, care: Any, want: Any, constants: Any, truth: Any,
 ) -> bool:  # fmt: skip
     """Write each row's query results to ``truth`` (B, S) bool, with QueryProgram's operations in the same order.
 
-    ``observation`` is (B, D) float32 or float64, in metres; ``task_id`` is (B,) int64; ``ids`` to ``constants`` are the
-    fields of :class:`QueryFacts`. Return False if a task has no queries or a number is NaN or infinite.
+    ``observation`` is (B, D) float32 or float64, in metres; ``task_id`` is (B,) int64; ``latches`` is (B, L) bool;
+    ``ids`` to ``constants`` are the fields of :class:`QueryFacts`. Return False if a task has no queries or a number
+    is NaN or infinite.
     """
     size = observation.shape[1]
     numbers = np.empty(size + constants.shape[0], observation.dtype)
@@ -39,6 +40,8 @@ def answer(
         # All integers are unsigned, since Numba promotes a mix of int64 and uint64 to float64.
         t = np.uint64(row)
         facts = np.uint64(0)
+        for n in range(latches.shape[1]):
+            facts |= np.uint64(latches[b, n]) << np.uint64(n)
         for a in range(ends[t, 0], ends[t, 1]):
             x = numbers[places[a, 0]] - numbers[places[a, 1]] + metres[a, 0]
             y = numbers[places[a, 2]] - numbers[places[a, 3]] + metres[a, 1]

@@ -15,11 +15,12 @@ from lw_torchrl._util.checks import check_choice, check_value, shown
 from lw_torchrl._util.devices import check_finite
 from lw_torchrl.language.gates import Gates, Truth, evaluate_gates
 from lw_torchrl.language.queries import Query, check_query
-from lw_torchrl.language.query_tables import QueryTables, compile_facts, compile_queries
+from lw_torchrl.language.query_tables import QueryTables, compile_facts, compile_queries, unroll
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import TASKS, Task, one_layout, task_ids
 
 _LEAST, _MOST = 1e-6, 1e4  # bounds on the magnitude of a logit, and on differentiated lengths (metres)
+_NO_LATCHES = np.empty((0, 0), dtype=bool)
 _COMPILED = {torch.float32: np.float32, torch.float64: np.float64}
 
 
@@ -45,6 +46,8 @@ class QueryProgram(nn.Module):
     Attributes:
         tasks: the names of the tasks, sorted.
         num_queries: the number of queries S in the longest list.
+        num_latches: the largest number L of latches of a task ("the puck has been near the goal"); see
+            :meth:`remember`.
         layout: the layout of the tasks' observations.
 
     Example:
@@ -73,6 +76,8 @@ class QueryProgram(nn.Module):
         self.queries = dict(sorted(((task.name, parsed) for task, parsed in compiled.items())))
         self.tasks = tuple(self.queries)
         self.num_queries = max(map(len, compiled.values()))
+        self.num_latches = max(len(unroll(listed)[1]) for listed in compiled.values())
+        self._columns = self.num_queries + self.num_latches
         index = TaskIndex(task_ids(self.tasks))
         in_order = dict(sorted(compiled.items(), key=lambda item: index.row(item[0].name)))
         tables, self._shapes = compile_queries(in_order)
@@ -84,31 +89,79 @@ class QueryProgram(nn.Module):
     def __repr__(self) -> str:
         return f"QueryProgram({len(self.tasks)} tasks, num_queries={self.num_queries})"
 
-    def forward(self, observation: Tensor, task_id: Tensor) -> Tensor:
+    def forward(self, observation: Tensor, task_id: Tensor, latches: Tensor | None = None) -> Tensor:
         """Answer the queries.
 
         Args:
             observation: (..., D) float, in the tasks' layout (39 numbers in metres for Meta-World).
             task_id: (...) int64, ids of tasks with queries.
+            latches: (..., L) bool, the latches of the previous or of the same step; only required if L > 0.
 
         Returns:
             (..., S) bool on the observation's device, in the order of the task's list of queries; padding is false.
 
         Raises:
-            ValueError: the inputs have a wrong shape or dtype, a NaN or an infinity, or a task without queries.
+            ValueError: the inputs have a wrong shape or dtype, a NaN or an infinity, or a task without queries; or
+                latches are missing.
         """
+        truth = self._columns_of(observation, task_id, latches)
+        return truth[..., : self.num_queries] if self.num_latches else truth
+
+    def remember(self, observation: Tensor, task_id: Tensor, latches: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Answer the queries and update the latches.
+
+        A latch is true from the first step of an episode in which its condition was true, including that step.
+
+        Args:
+            observation, task_id: as for :meth:`forward`.
+            latches: (..., L) bool, the latches of the previous step; false in the first step of an episode.
+
+        Returns:
+            the answers (..., S) bool, and the latches of this step (..., L) bool.
+
+        Example:
+            >>> from lw_torchrl.language.tasks import task_id
+            >>> program = QueryProgram({"reach": ["the gripper has been open"]})
+            >>> observation, ids = torch.zeros(1, 39), torch.tensor([task_id("reach")])
+            >>> program.remember(observation, ids, torch.tensor([[False]]))
+            (tensor([[False]]), tensor([[False]]))
+            >>> program.remember(observation, ids, torch.tensor([[True]]))
+            (tensor([[True]]), tensor([[True]]))
+        """
+        truth = self._columns_of(observation, task_id, latches)
+        return truth[..., : self.num_queries], truth[..., self.num_queries :]
+
+    def _columns_of(self, observation: Tensor, task_id: Tensor, latches: Tensor | None) -> Tensor:
+        """Return the truth (..., S + L) bool of the queries and latches."""
         _check_batch(observation, task_id, self.layout.size)
-        if (kernel := self._kernel(observation, task_id)) is not None:
-            return self._answer(kernel, observation, task_id)
+        self._check_latches(task_id, latches)
+        if (kernel := self._kernel(observation, task_id, latches)) is not None:
+            return self._answer(kernel, observation, task_id, latches)
         check_finite("observation", observation)
         tables = self._tables.select(task_id.reshape(-1), observation)
         atoms = (self._values(observation, tables) < tables.threshold) ^ tables.flipped
-        return self._combine(atoms, tables, "exact").reshape(*task_id.shape, self.num_queries)
+        if latches is not None and self.num_latches:
+            atoms = torch.cat((atoms, latches.reshape(-1, self.num_latches)), 1)
+        return self._combine(atoms, tables, "exact").reshape(*task_id.shape, self._columns)
+
+    def _check_latches(self, task_id: Tensor, latches: Tensor | None) -> None:
+        if not self.num_latches:
+            return
+        shape = (*task_id.shape, self.num_latches)
+        if latches is None:
+            raise ValueError(
+                "the queries depend on earlier steps of the episode ('has been', 'once (...)'), which one observation "
+                f"does not show: pass latches, bool of shape {shape}, from QAFTransform or from remember()"
+            )
+        if latches.shape != shape or latches.dtype != torch.bool:
+            got = f"got {latches.dtype} of shape {tuple(latches.shape)}"
+            raise ValueError(f"latches must be bool of shape {shape}, {got}")
 
     def logits(
         self,
         observation: Tensor,
         task_id: Tensor,
+        latches: Tensor | None = None,
         *,
         temperature: float = 1.0,
         truth: Literal["min-max", "product"] = "min-max",
@@ -124,7 +177,7 @@ class QueryProgram(nn.Module):
         may have a negative logit near a threshold. Gradients are finite.
 
         Args:
-            observation, task_id: as for :meth:`forward`.
+            observation, task_id, latches: as for :meth:`forward`. A latch that is already true has the logit 1e4.
             temperature: a factor on every comparison's temperature, between 1e-6 and 1e6.
             truth: how the operands of "and" and "or" are combined, "min-max" or "product".
 
@@ -134,34 +187,49 @@ class QueryProgram(nn.Module):
         if not isinstance(temperature, Real) or not 1e-6 <= temperature <= 1e6:  # a check that torch.compile can trace
             raise ValueError(f"temperature must be between 1e-6 and 1e6, got {temperature!r}")
         check_choice("truth", truth, ("min-max", "product"))
-        exact = self(observation.detach(), task_id)
+        exact = self._columns_of(observation.detach(), task_id, latches)
         state = observation if observation.dtype in _COMPILED else observation.float()
         state = state.clamp(-_MOST, _MOST)  # squares of larger numbers overflow
         tables = self._tables.select(task_id.reshape(-1), state)
         margin = (tables.threshold - self._values(state, tables, floor=_LEAST)) / tables.temperature / temperature
-        soft = self._combine(torch.where(tables.flipped, -margin, margin), tables, truth).float().reshape(exact.shape)
+        margin = torch.where(tables.flipped, -margin, margin)
+        if latches is not None and self.num_latches:
+            before = torch.where(latches.reshape(-1, self.num_latches), _MOST, -_MOST)
+            margin = torch.cat((margin, before.to(margin.dtype)), 1)
+        soft = self._combine(margin, tables, truth).float().reshape(exact.shape)
+        if self.num_latches:
+            soft, exact = soft[..., : self.num_queries], exact[..., : self.num_queries]
         if truth == "product":
             return soft.clamp(-_MOST, _MOST)
         size = torch.where(exact, soft, -soft).detach().clamp(_LEAST, _MOST)
         # The value has the sign of the hard truth, even exactly on a threshold; the gradient is the gradient of soft.
         return soft - soft.detach() + torch.where(exact, size, -size)
 
-    def _kernel(self, observation: Tensor, task_id: Tensor) -> Callable[..., bool] | None:
+    def _kernel(
+        self, observation: Tensor, task_id: Tensor, latches: Tensor | None = None
+    ) -> Callable[..., bool] | None:
         """Return the kernel if it supports these tensors; else None."""
         on_cpu = observation.dtype in self._facts and observation.is_cpu and task_id.is_cpu
         fits = on_cpu and self._tables.plain(observation, task_id) and not observation.is_neg()
+        if latches is not None and self.num_latches:
+            fits = fits and latches.is_cpu and self._tables.plain(latches)
         return find_kernel() if fits else None
 
-    def _answer(self, kernel: Callable[..., bool], observation: Tensor, task_id: Tensor) -> Tensor:
+    def _answer(
+        self, kernel: Callable[..., bool], observation: Tensor, task_id: Tensor, latches: Tensor | None = None
+    ) -> Tensor:
         """Answer with the kernel. PyTorch operations are slow here, since physics has just evicted the CPU's caches."""
         states = observation.numpy(force=observation.requires_grad).reshape(-1, self.layout.size)
         ids = task_id.numpy().reshape(-1)
-        truth = np.empty((len(ids), self.num_queries), dtype=bool)
-        batch = np.ascontiguousarray(states), np.ascontiguousarray(ids, dtype=np.int64)
+        truth = np.empty((len(ids), self._columns), dtype=bool)
+        before = _NO_LATCHES
+        if latches is not None and self.num_latches:
+            before = np.ascontiguousarray(latches.numpy().reshape(-1, self.num_latches))
+        batch = np.ascontiguousarray(states), np.ascontiguousarray(ids, dtype=np.int64), before
         if not kernel(*batch, *self._facts[observation.dtype], truth):
             check_finite("observation", observation)
             self._tables.select(task_id.reshape(-1), observation)  # either this call or the one above raises
-        return torch.from_numpy(truth.reshape(*task_id.shape, self.num_queries))
+        return torch.from_numpy(truth.reshape(*task_id.shape, self._columns))
 
     def _combine(self, atoms: Tensor, tables: QueryTables, truth: Truth) -> Tensor:
         """Return the truth or the logits (B, S) of queries from those of all atoms (B, A)."""

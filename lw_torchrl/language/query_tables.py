@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl.language.expressions import FALSE, Expression, leaves, negate
+from lw_torchrl.language.expressions import FALSE, Expression, Once, all_of, any_of, fold, leaves, negate
 from lw_torchrl.language.gates import Operand, Shapes, compile_gates, inner_gates
 from lw_torchrl.language.objects import TypedPosition, coordinate_indices, typed_position
 from lw_torchrl.language.queries import Clause, Query
@@ -82,8 +83,44 @@ def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
     return [Atom(first, second, shift, part) for part in comparisons(clause.predicate, task.layout)]
 
 
+@dataclass(frozen=True)
+class Before:
+    """A leaf: the truth of latch ``number`` before the current step."""
+
+    number: int
+
+
+def unroll(queries: Iterable[Query]) -> tuple[list[Expression], list[Expression]]:
+    """Return queries without latches, and the expression of each latch, inner latches first.
+
+    Latch n is replaced by "Before(n), or its condition is true now".
+    """
+    latches: dict[Once, Expression] = {}
+
+    def visit(each: Expression, parts: list[Expression]) -> Expression:
+        if each.kind != "leaf":
+            return all_of(parts) if each.kind == "all" else any_of(parts)
+        if not isinstance(each.leaf, Once):
+            return each
+        if each.leaf not in latches:
+            now = fold(each.leaf.condition, visit)
+            latches[each.leaf] = any_of([Before(len(latches)), now])
+        return negate(latches[each.leaf]) if each.negated else latches[each.leaf]
+
+    return [fold(query.expression, visit) for query in queries], list(latches.values())
+
+
+def _columns(queries: Mapping[Task, Sequence[Query]]) -> tuple[list[list[Expression]], int]:
+    """Return each task's expressions, S for queries and L for latches, and L. The lists are shorter if L is 0."""
+    unrolled = [unroll(listed) for listed in queries.values()]
+    latches = max(len(own) for _, own in unrolled)
+    steps = max(map(len, queries.values())) if latches else 0
+    return [own + [FALSE] * (steps - len(own)) + latched for own, latched in unrolled], latches
+
+
 class QueryTables(NamedTuple):
-    """Tensors that encode queries: the A atoms of each task, and the gates that make S queries of them.
+    """Tensors that encode queries: the A atoms of each task, and the gates that make S queries and L latches of them
+    and of the L latches before.
 
     The first dimension is the tasks (T), or the rows of the batch (B) in tables that were selected for a batch.
     """
@@ -103,19 +140,24 @@ class QueryTables(NamedTuple):
 
 def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> tuple[QueryTables, Shapes]:
     """Compile the queries of tasks to tables, one row per task in the order of the mapping, and the shapes of gates."""
-    expressions = [[query.expression for query in listed] for listed in queries.values()]
+    expressions, latches = _columns(queries)
     atoms_of = [
-        {clause: clause_atoms(clause, task) for query in listed for clause in leaves(query.expression)}
-        for task, listed in queries.items()
+        {leaf: clause_atoms(leaf, task) for leaf in chain(*map(leaves, listed)) if not isinstance(leaf, Before)}
+        for task, listed in zip(queries, expressions, strict=True)
     ]
     compiled = [list(dict.fromkeys([_ALWAYS, *chain(*own.values())])) for own in atoms_of]
     most = max(map(len, compiled))
 
     def operand(own: dict[Clause, list[Atom]], place: dict[Atom, int]) -> Callable[[Expression], Operand]:
-        return lambda literal: ([place[atom] for atom in own[literal.leaf]], literal.negated)
+        def values(literal: Expression) -> Operand:
+            leaf = literal.leaf
+            numbers = [most + leaf.number] if isinstance(leaf, Before) else [place[atom] for atom in own[leaf]]
+            return numbers, literal.negated
+
+        return values
 
     places = [{atom: number for number, atom in enumerate(atoms)} for atoms in compiled]
-    gates = compile_gates(expressions, list(map(operand, atoms_of, places)), most, true=0)
+    gates = compile_gates(expressions, list(map(operand, atoms_of, places)), most + latches, true=0)
     listed = [atoms + [_ALWAYS] * (most - len(atoms)) for atoms in compiled]
     constants, size = [0.0], one_layout(queries).size
 
@@ -147,7 +189,8 @@ Bits = NDArray[np.uint64]
 class QueryFacts(NamedTuple):
     """The facts (F) of all tasks as bits, one task after another.
 
-    A task's facts are its length comparisons, single-coordinate comparisons and gates (D). A gate or a query
+    A task's facts are its latches before (L, the first bits), length comparisons, single-coordinate comparisons and
+    gates (D). A gate or a query
     is true if ``facts & care == want``, where ``care`` masks the bits that it depends on.
     """
 
@@ -171,18 +214,23 @@ class QueryFacts(NamedTuple):
 Condition = tuple[int, int]  # (care, want)
 
 
-def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], dict[Condition, int], list[Condition]]:
-    """Return each atom's bit number, each gate's bit, and each query's (care, want) bit masks."""
-    expressions = [query.expression for query in queries]
+def _task_facts(
+    task: Task, expressions: Sequence[Expression], latches: int
+) -> tuple[dict[Atom, int], dict[Condition, int], list[Condition]]:
+    """Return each atom's bit number, each gate's bit, and each expression's (care, want) bit masks."""
     places: dict[Atom, int] = {}
-    bits: dict[Clause, int] = {}
+    bits: dict[Clause | Before, int] = {}
     # Number all atoms first, since the bits of gates follow the bits of atoms.
-    for clause in dict.fromkeys(chain(*map(leaves, expressions))):
-        bits[clause] = sum({1 << places.setdefault(atom, len(places)) for atom in clause_atoms(clause, task)})
+    for leaf in dict.fromkeys(chain(*map(leaves, expressions))):
+        if isinstance(leaf, Before):
+            bits[leaf] = 1 << leaf.number
+        else:
+            atoms = clause_atoms(leaf, task)
+            bits[leaf] = sum({1 << places.setdefault(atom, latches + len(places)) for atom in atoms})
     gates: dict[Condition, int] = {}
 
     def gate(condition: Condition) -> int:
-        return gates.setdefault(condition, 1 << len(places) + len(gates))
+        return gates.setdefault(condition, 1 << latches + len(places) + len(gates))
 
     def conjunction(parts: Sequence[Expression]) -> Condition:
         true = false = 0
@@ -213,8 +261,9 @@ def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
     for row, number in enumerate(ids):
         if number < len(MT50):
             row_of[number] = row
-    tasks = [_task_facts(task, listed) for task, listed in queries.items()]
-    if max(len(atoms) + len(together) for atoms, together, _ in tasks) > MOST_FACTS:
+    columns, latches = _columns(queries)
+    tasks = [_task_facts(task, listed, latches) for task, listed in zip(queries, columns, strict=True)]
+    if latches + max(len(atoms) + len(together) for atoms, together, _ in tasks) > MOST_FACTS:
         return None
     constants, size = [0.0], one_layout(queries).size
     places: list[list[int]] = []

@@ -266,6 +266,11 @@ class ClauseEvaluator(QueryEvaluator):
         # The distinct clauses of each plan, in the order of the steps.
         by_plan = [list(dict.fromkeys(c for step in plan.steps for c in step.condition.clauses)) for plan in plans]
         most, start = max(map(len, by_plan)), 0
+        if latched := [plan.task for plan in plans if any(step.condition.has_latch for step in plan.steps)]:
+            raise ValueError(
+                "a learned evaluator answers conditions on one observation, but plans of "
+                f"{', '.join(latched)} depend on earlier steps ('has been', 'once (...)'); use QAFTransform"
+            )
         if not most:
             raise ValueError("plans must have a condition with a clause, got only 'always' and 'never'")
         number = torch.zeros(len(tasks), most, dtype=torch.int64)

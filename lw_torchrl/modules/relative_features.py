@@ -271,7 +271,9 @@ class RoleFeatures(_RelativePositions):
         observation, task_id = read(rows, [self.in_keys[0], self.in_keys[2]])
         observation, task_id = observation.reshape(-1, self.layout.size), task_id.reshape(-1)
         check_rows(observation)
-        truth = plan_program(self.plans)(observation, task_id)
+        program = plan_program(self.plans)
+        latches = rows.get("qaf_latches", None) if program.num_latches else None
+        truth = program(observation, task_id, None if latches is None else latches.reshape(len(observation), -1))
         at = self.tables.rows(task_id)
         observation, truth, at = (tensor.to(self.contact.device) for tensor in (observation, truth, at))
         acting = (self.attention.weights(truth, at) * self.acts[at]).sum(-1) > 0.5

@@ -36,7 +36,7 @@ from lw_torchrl.record.recorded_episode import Ghost, RecordedEpisode
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import Suite, known_suite, load_suite
-from lw_torchrl.transforms.qaf import QAFTransform
+from lw_torchrl.transforms.qaf import QAFTransform, latches_of_rows
 
 _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
 _PLAN_KEYS = ("qaf", "qaf_logits", "skill_weights", "action_corrected")
@@ -264,7 +264,12 @@ def run_recorded(
         if has_answers and own_plans is not None:  # add the exact truth values to those that the policy used
             if "qaf_logits" not in steps.keys():
                 steps.set("qaf_logits", 10.0 * steps.get("qaf").float() - 5.0)
-            steps = QAFTransform(own_plans)(steps)
+            answer = QAFTransform(own_plans)
+            if answer.program.num_latches:
+                trajectory = torch.zeros_like(steps.get("task_id"))
+                latches = latches_of_rows(answer.program, steps.get("observation"), steps.get("task_id"), trajectory)
+                steps.set(answer.out_keys[2], latches)
+            steps = answer(steps)
         finished[episode.task, episode.episode] = episode._replace(steps=steps)
 
     run_rollout(

@@ -44,6 +44,31 @@ def plan_number_key(qaf: NestedKey) -> NestedKey:
     return key_beside(qaf, "_plan")
 
 
+def latches_key(qaf: NestedKey) -> NestedKey:
+    """Return the key to which :class:`QAFTransform` writes the latches: ``qaf_latches`` for ``qaf``."""
+    return key_beside(qaf, "_latches")
+
+
+def latches_of_rows(program: QueryProgram, observation: Tensor, task_id: Tensor, trajectory: Tensor) -> Tensor:
+    """Compute the latches (R, L) bool in all rows of whole episodes.
+
+    Args:
+        program: the program of the plans' conditions.
+        observation, task_id: (R, D) float and (R,) int64, the rows of consecutive episodes in the order of time.
+        trajectory: (R,) int64, a number that changes where an episode begins.
+    """
+    latches = torch.zeros(len(task_id), program.num_latches, dtype=torch.bool, device=observation.device)
+    is_first = torch.ones(len(task_id), dtype=torch.bool, device=observation.device)
+    is_first[1:] = trajectory[1:] != trajectory[:-1]
+    start = is_first.nonzero().flatten()
+    length = torch.diff(start, append=start.new_tensor([len(task_id)]))
+    for step in range(int(length.max()) if len(length) else 0):
+        rows = start[length > step] + step
+        before = latches[rows - 1] if step else torch.zeros_like(latches[rows])
+        latches[rows] = program.remember(observation[rows], task_id[rows], before)[1]
+    return latches
+
+
 class QAFTransform(KeepsEnvState):
     """A transform that answers the conditions of each row's plan, in an environment or on a replay buffer.
 
@@ -53,6 +78,11 @@ class QAFTransform(KeepsEnvState):
     writes ``("next", "qaf")`` if ``("next", "observation")`` exists. In an environment, the ``state_dict`` includes
     that of the environment, as for :class:`EnvState`.
 
+    If a condition has latches ("the puck has been near the goal", "once (...)"), it also writes ``qaf_latches``
+    (B, L) bool: the latches that are true since an earlier or this step of the episode. In an environment, every reset
+    of a row clears its latches. Rows of a replay buffer must have this key: rollouts have it, and
+    :class:`LanguageWorldExperienceReplay` computes it.
+
     Conditions compare metres, so put this transform before transforms that change the observation, such as
     ``ObservationNorm`` or :class:`RandomYaw`. A wrong order raises an error, except in the workers of a SerialEnv or
     ParallelEnv.
@@ -60,12 +90,12 @@ class QAFTransform(KeepsEnvState):
     Args:
         plans: a plan for each task that will be seen.
         in_keys: replacements for the keys ``observation`` and ``task_id``, in this order.
-        out_keys: a replacement for the key ``qaf``; the suffix ``_plan`` gives the key of the plan's number.
+        out_keys: a replacement for the key ``qaf``; the suffixes ``_plan`` and ``_latches`` give the other keys.
 
     Raises:
         PlanError: (a ValueError) the environment has a task without a plan.
-        ValueError: a task has no plan, the observation is malformed or has half precision, or an earlier transform
-            changes the observation.
+        ValueError: a task has no plan, the observation is malformed or has half precision, an earlier transform
+            changes the observation, or rows of a replay buffer lack latches.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -81,10 +111,12 @@ class QAFTransform(KeepsEnvState):
     def __init__(self, plans: AnyPlans, *, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:
         truth = as_keys("out_keys", out_keys, ("qaf",))
         keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
-        super().__init__(in_keys=keys, out_keys=[*truth, plan_number_key(truth[0])])
+        plans = as_plans(plans)
+        program = plan_program(plans)
+        latches = [latches_key(truth[0])] if program.num_latches else []
+        super().__init__(in_keys=keys, out_keys=[*truth, plan_number_key(truth[0]), *latches])
         check_apart(self.in_keys, self.out_keys)
-        self.plans = as_plans(plans)
-        self.program = plan_program(self.plans)
+        self.plans, self.program = plans, program
         tables = PlanTables(self.plans)
         self._number = TaskTables(tables.index, _Number(tables.number), f"tasks without a plan in {self.plans!r}")
         self._task: Tensor | None = None  # the task of each row since its last reset
@@ -93,7 +125,8 @@ class QAFTransform(KeepsEnvState):
         """Return a transform that answers the conditions of different plans."""
         return QAFTransform(plans, in_keys=self.in_keys, out_keys=self.out_keys[:1])
 
-    def _write(self, tensordict: TensorDictBase, task_id: Tensor | None) -> None:
+    def _write(self, tensordict: TensorDictBase, task_id: Tensor | None, before: Tensor | None = None) -> None:
+        """Write the answers, and the latches that follow from those ``before``."""
         observation = tensordict.get(self.in_keys[0], None)
         if observation is None or task_id is None:
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys))
@@ -101,27 +134,59 @@ class QAFTransform(KeepsEnvState):
             got = f"got {observation.dtype}; put QAFTransform before the transform that casts the observation"
             raise ValueError(f"observation must be float32 or float64, {got}")
         task_id = one_per_row(task_id, observation)
-        tensordict.set(self.out_keys[0], self.program(observation, task_id))
+        if self.program.num_latches:
+            truth, latches = self.program.remember(observation, task_id, before)
+            tensordict.set(self.out_keys[2], latches)
+        else:
+            truth = self.program(observation, task_id)
+        tensordict.set(self.out_keys[0], truth)
         number = self._number.select(task_id.reshape(-1), observation).plan
         tensordict.set(self.out_keys[1], number.reshape(task_id.shape).clone())  # a collector zeroes it in place
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._write(next_tensordict, next_tensordict.get(self.in_keys[1], None))
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        before = None
+        if self.program.num_latches:
+            before = tensordict.get(self.out_keys[2], None)
+            if before is None:
+                raise ValueError(f"a step requires {self.out_keys[2]!r}, the latches before it, which a reset writes")
+        self._write(next_tensordict, next_tensordict.get(self.in_keys[1], None), before)
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         begun, task = tensordict.get("_reset", None), tensordict_reset.get(self.in_keys[1], None)
         self._task = task if task is None else reset_rows(self._task, task, begun)
-        self._write(tensordict_reset, self._task)
+        self._write(tensordict_reset, self._task, self._cleared(tensordict, tensordict_reset, begun))
         return tensordict_reset
+
+    def _cleared(self, tensordict: TensorDictBase, fresh: TensorDictBase, begun: Tensor | None) -> Tensor | None:
+        """Return the latches of all rows, false in the rows that are reset.
+
+        If TorchRL passes no latches, it restores those of the other rows itself.
+        """
+        observation = fresh.get(self.in_keys[0], None)
+        if not self.program.num_latches or observation is None:
+            return None
+        shape = (*observation.shape[:-1], self.program.num_latches)
+        none = torch.zeros(shape, dtype=torch.bool, device=observation.device)
+        return reset_rows(tensordict.get(self.out_keys[2], None), none, begun, 1)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation, task = self.in_keys
-        task_id = tensordict.get(task, None)
-        self._write(tensordict, task_id)
+        task_id, before = tensordict.get(task, None), None
+        if self.program.num_latches:
+            before = tensordict.get(self.out_keys[2], None)
+            if before is None:
+                raise ValueError(
+                    f"the plans' conditions depend on earlier steps ('has been', 'once (...)'), but the rows have no "
+                    f"{self.out_keys[2]!r}: use a rollout with this QAFTransform or LanguageWorldExperienceReplay("
+                    "transform=QAFTransform(plans)), which compute it per episode"
+                )
+        self._write(tensordict, task_id, before)
         following = tensordict.get("next", None)
         if following is not None and following.get(observation, None) is not None:
-            self._write(following, following.get(task, task_id))
+            if self.program.num_latches:
+                before = following.get(self.out_keys[2], tensordict.get(self.out_keys[2]))
+            self._write(following, following.get(task, task_id), before)
         return tensordict
 
     def set_container(self, container: Transform | EnvBase) -> None:
@@ -137,7 +202,21 @@ class QAFTransform(KeepsEnvState):
         steps, shape, device = self.program.num_queries, observation_spec.shape, observation_spec.device
         observation_spec[self.out_keys[0]] = Binary(steps, shape=(*shape, steps), dtype=torch.bool, device=device)
         observation_spec[self.out_keys[1]] = Unbounded(shape, dtype=torch.int64, device=device)
+        if self.program.num_latches:
+            observation_spec[self.out_keys[2]] = self._latches_spec(shape, device)
         return observation_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        if self.program.num_latches:  # so that batched environments send the latches to their workers
+            if input_spec["full_state_spec"] is None:
+                input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
+            spec = self._latches_spec(input_spec.shape, input_spec.device)
+            input_spec["full_state_spec"][self.out_keys[2]] = spec
+        return input_spec
+
+    def _latches_spec(self, shape: torch.Size, device: torch.device | None) -> Binary:
+        count = self.program.num_latches
+        return Binary(count, shape=(*shape, count), dtype=torch.bool, device=device)
 
 
 class CorruptQAF(EpisodeTransform):

@@ -15,7 +15,7 @@ from lw_torchrl.data.dataset import Demonstrations
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.suites.suite import Suite
-from lw_torchrl.transforms.qaf import plan_program
+from lw_torchrl.transforms.qaf import latches_of_rows, plan_program
 
 Array = np.ndarray[Any, Any]
 KEYS: Mapping[str, tuple[str, ...]] = {
@@ -93,7 +93,11 @@ def _holds(table: Table, plans: Plans) -> Array:
     task = torch.from_numpy(table.repeat([task_id(task) for task in table.tasks]))
     planned = torch.from_numpy(table.repeat([task in plans for task in table.tasks])).nonzero().flatten()
     observation = torch.from_numpy(table.columns["observation"])
+    latches = torch.zeros(table.rows, program.num_latches, dtype=torch.bool)
+    if program.num_latches:
+        episode = torch.from_numpy(table.repeat(list(range(len(table.tasks)))))
+        latches[planned] = latches_of_rows(program, observation[planned], task[planned], episode[planned])
     holds = torch.zeros(table.rows, max(len(plan.steps) for plan in plans.values()), dtype=torch.bool)
     for rows in planned.split(_BLOCK):
-        holds[rows] = program(observation[rows], task[rows])
+        holds[rows] = program(observation[rows], task[rows], latches[rows])
     return holds.numpy()

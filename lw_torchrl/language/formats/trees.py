@@ -137,6 +137,8 @@ class _Tree:
 
     def object(self, row: dict[str, Any]) -> Node | None:
         kind = _TYPES.get(" ".join(words_of(str(_get(row, "type", "")))))
+        memory = kind == "memory" or _is_true(_get(row, "memory"))
+        kind = "sequence" if kind == "memory" else kind
         condition, then = _get(row, "condition"), _get(row, "action")
         children = _get(row, "children")
         if (states := _get(row, "states")) is not None:
@@ -145,18 +147,20 @@ class _Tree:
             parts = tuple(self.children(children))
             if kind == "not" and all(map(is_condition, parts)):
                 return Check(negate(all_of(part.condition for part in parts if isinstance(part, Check))))
-            return (Selector if kind == "selector" else Sequence)(parts)
+            return Selector(parts) if kind == "selector" else Sequence(parts, memory)
         if kind == "condition":
             return Check(self.condition(row))
         if kind == "action" or (kind is None and condition is None and isinstance(then, str)):
             return self.until(self.action(row), row)
-        for role in ("rules", "sequence"):
+        for role in ("rules", "sequence", "remembered"):
             if (rules := _get(row, role)) is not None:
                 parts = tuple(self.children(rules))
                 last = self.node(_get(row, "otherwise"))
                 parts = parts if last is None else (*parts, last)
                 if role == "rules" or last is not None:
                     return Selector(parts)
+                if memory or role == "remembered":
+                    return Sequence(parts, memory=True)
                 return (Block if any(isinstance(part, Branch) for part in parts) else Sequence)(parts)
         if condition is not None:
             test = negate(self.condition(condition)) if "unless" in row else self.condition(condition)
