@@ -203,6 +203,7 @@ class Read:
     task: Maybe[str] = None  # show only the plan for this task (default for an answer: the task in the file name)
     format: Maybe[str] = None  # plan format of an answer (default: the folder's name, or found by the content)
     out: Maybe[Path] = None  # folder for the most confident plan of each task, as a .plan file (not completed)
+    scripted: Flag = False  # read an answer's skills as the nearest scripted skills, which `evaluate scripted` requires
     task_file: options.TaskFile = None
     json: options.Json = False
 
@@ -215,7 +216,7 @@ class Read:
             for plan, decoded in self._plans(source):
                 report = explain_canonical(plan)
                 where = {"task": plan.task, "source": f"{report.source}, confidence {report.plan.confidence:.2f}"}
-                tree = _tree(report.notes(), report, decoded)
+                tree = _tree(report.notes(), report, None if self.scripted else decoded)
                 rows += [{**where, **row} for row in tree if "written" in row]
                 notes = [] if decoded is None else [str(note) for note in decoded.notes]
                 known = {"task": plan.task, "source": report.source, "confidence": report.plan.confidence}
@@ -261,8 +262,10 @@ class Read:
         if format is None and folder in PLAN_FORMATS:
             format = folder
         decoded = decode_plan(read_text(file, ValueError), task, format, tasks=known)
+        if self.scripted and decoded.plan is not None and decoded.scripted is None:
+            raise PlanError(f"{file}: --scripted: no step has a scripted skill that is near enough")
         if decoded.plan is not None:
-            return [(decoded.plan, decoded)]
+            return [((decoded.scripted if self.scripted else None) or decoded.plan, decoded)]
         if len(self.sources) == 1:
             raise PlanError(f"{file}: no plan can be read: {decoded.reason}")
         print(f"{file}: no plan can be read: {printable(decoded.reason)}")

@@ -97,6 +97,8 @@ class Train:
             if (distribution := DISTRIBUTIONS[self.loss]) is not None:
                 actor = actor.stochastic(distribution)
             trainer = self._learn(actor, plans, rows, run)
+        if trainer.steps and not self.json:
+            print(f"resuming at step {trainer.steps}", flush=True)
         loss, steps = trainer.train(), trainer.config.steps
         output = Output(self.json).show("policy", self.out).show("steps", steps)
         return output.show("loss", loss, f"{_trained(steps, loss)}: {self.out}")
@@ -235,7 +237,7 @@ def make_logger(kind: str, out: Path) -> Any:
     try:
         return get_logger(kind, str(out.parent / "logs"), out.stem)
     except ImportError as error:
-        raise ImportError(f"--logger {kind} requires the package {kind}: pip install {kind}") from error
+        raise ImportError(f"--logger {kind} requires the package {kind}: pip install {kind} ({error})") from error
 
 
 _CAMERAS = (
