@@ -57,7 +57,8 @@ def start_early(workers: int | None, time_steps: int) -> None:
 
 def split(episodes: Episodes, workers: int) -> list[dict[str, list[int]]]:
     """Split episodes into parts of equal size, at least one for each worker. A part holds few tasks, because each task
-    takes time to set up."""
+    takes time to set up.
+    """
     listed = [(task, episode) for task, numbers in episodes.items() for episode in numbers]
     number = min(len(listed), workers * -(-len(listed) // (workers * _LARGEST)))
     parts: list[dict[str, list[int]]] = [{} for _ in range(number)]
@@ -84,9 +85,9 @@ def spread(
             runs for each part, and the items are pickled.
         episodes: the indices of each task's episodes.
         workers: number of processes, 1 for this process only. None for one per core, or for this process only if the
-            workers' start would take longer than they save, or ``run`` cannot be pickled.
+            startup would take longer than it saves, or ``run`` cannot be pickled.
         max_steps: maximum number of time steps of an episode.
-        alone: whether None means this process only.
+        alone: whether ``workers=None`` means this process only.
 
     Raises:
         ValueError: ``run`` cannot be pickled.

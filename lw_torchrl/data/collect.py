@@ -135,7 +135,7 @@ def _env_and_actor(config: CollectConfig, policy: Any, env: LanguageWorldEnv) ->
 
 
 def suite_expert(suite: Suite, tasks: Sequence[str]) -> Any:
-    """Return a suite's expert, or an actor with the suite's scripted skills and plans; ValueError without either."""
+    """Return a suite's expert or an actor with its scripted skills and plans; raise ValueError if it has neither."""
     if suite.make_expert is not None:
         return suite.make_expert(tasks)
     if suite.plans is None or suite.skills is None:

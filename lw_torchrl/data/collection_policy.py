@@ -85,7 +85,8 @@ BEHAVIOURS: Mapping[str, Behaviour] = MappingProxyType(
 )
 """The shipped collection policies by name: "expert" (Meta-World's script), "scripted" (scripted skills that follow the
 plan), "noisy-60" and "noisy-30" (scripted skills in 60 % or 30 % of the segments, random skills of the plan in the
-others), "wrong" (only random skills of the plan) and "random" (random actions in [-1, 1])."""
+others), "wrong" (only random skills of the plan) and "random" (random actions in [-1, 1]).
+"""
 
 
 def check_own_label(behaviour: Behaviour) -> None:
@@ -114,7 +115,7 @@ def behaviour_of(
             return Behaviour(name, "policy")
         if draws(policy):
             raise ValueError(
-                f"policy: this {type(policy).__name__} is stochastic and draws random numbers call by call, so the "
+                f"policy: this {type(policy).__name__} is stochastic and draws random numbers at each call, so the "
                 "episodes would depend on num_envs and on interruptions; use a deterministic policy"
             )
         return Behaviour(name, "policy", fingerprint=policy_fingerprint(policy))

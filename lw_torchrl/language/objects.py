@@ -80,7 +80,7 @@ def _read_position(value: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
 
 
 def _read_object(name: str, row: Any) -> NamedObject:
-    """Parse an object of tasks.toml: a position, or {position = ..., opening = "obs[92]"}."""
+    """Parse an object from tasks.toml: a position, or {position = ..., opening = "obs[92]"}."""
     if not isinstance(row, Mapping):
         return NamedObject(name, _read_position(row))
     for key in row:

@@ -187,7 +187,7 @@ def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) 
 
 
 def _with_clauses(read: Callable[[str], Reading], text: str, mapper: StepMapper) -> tuple[Reading, Section]:
-    """Read a text, compile the programs for the task, and return the reading and its section of the most clauses."""
+    """Parse a text, compile the programs for the task; return the result and its section with the most clauses."""
 
     def effect(skill: str) -> str | None:
         goal = mapper.query(skill.partition(" until ")[2]) if " until " in skill else None

@@ -111,7 +111,7 @@ def unroll(queries: Iterable[Query]) -> tuple[list[Expression], list[Expression]
 
 
 def _columns(queries: Mapping[Task, Sequence[Query]]) -> tuple[list[list[Expression]], int]:
-    """Return each task's expressions, S for queries and L for latches, and L. The lists are shorter if L is 0."""
+    """Return each task's S query and L latch expressions (possibly fewer than S if L is 0), and the number L."""
     unrolled = [unroll(listed) for listed in queries.values()]
     latches = max(len(own) for _, own in unrolled)
     steps = max(map(len, queries.values())) if latches else 0

@@ -78,7 +78,7 @@ STATES = Registry("state", "lw_torchrl.states", _predicates("states"), _check_st
 The shipped states are "open" and "closed"; add a state with ``STATES["on"] = STATES["open"]``.
 """
 UNARY = ChainMap[str, tuple[Comparison, ...]](STATES, _OF_POSITION)  # type: ignore[arg-type]
-"""The predicates of one object: "touching the table" (compares the object's z) and the states of its opening."""
+"""Predicates of a single object: "touching the table" (based on the object's z) and the states of its opening."""
 RELATIONS = Registry("relation", "lw_torchrl.relations", _predicates("relations"), _check_relation)
 """The relations between two objects: the paper's 13 relations, and those that you add (see docs/custom-networks.md).
 

@@ -261,7 +261,7 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[
 
 
 def named_tasks(tasks: TaskList, *, known: Tasks = TASKS) -> dict[str, Task]:
-    """Map the sorted names of the tasks that ``tasks`` selects to :class:`Task` objects.
+    """Return the selected tasks as a dict from name to :class:`Task`, sorted by name.
 
     Args:
         tasks: names as for :func:`resolve_tasks`, or :class:`Task` objects, which replace known tasks with the same

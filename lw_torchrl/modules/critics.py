@@ -87,8 +87,8 @@ class Value(RenamedInputs):
 class QValue(Value):
     """A state-action value network: a trunk with one or more value heads, which also read the action.
 
-    Reads the trunk's input keys and ``action`` (B, A) float32; writes ``state_action_value`` (B, 1) float32, minimal
-    over the heads, and, with several heads, ``state_action_values`` (B, E) float32. With ``quantiles`` above 1,
+    Reads the trunk's input keys and ``action`` (B, A) float32; writes ``state_action_value`` (B, 1) float32, the
+    minimum over the heads, and, with several heads, ``state_action_values`` (B, E) float32. With ``quantiles`` > 1,
     ``state_action_value`` is (B, Q) float32.
 
     Args:

@@ -22,8 +22,8 @@ from lw_torchrl.modules.parts import Part, in_mode_of
 
 
 class ScriptedSkillActor(Part):
-    """A policy that executes plans with scripted skills: the skill of a step whose condition is true acts, else the
-    last step's.
+    """A policy that executes plans with scripted skills: the skill of a step whose condition is true acts;
+    if no condition is true, the last step's skill acts.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
     truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, whose rows sum to 1. Soft

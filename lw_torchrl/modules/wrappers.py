@@ -105,7 +105,7 @@ class ActorEnsemble(_Wrapper):
         return write(tensordict, self, means)
 
     def with_plans(self, plans: AnyPlans) -> ActorEnsemble:
-        """Return an ensemble that follows different plans but shares the networks."""
+        """Return a copy of the ensemble that follows other plans but shares its networks."""
         return in_mode_of(self, ActorEnsemble([with_plans(member, plans) for member in self.members]))
 
 
@@ -266,7 +266,7 @@ class TransferredActor(_ActionWrapper):
             layout.displaced("TransferredActor")  # raises for a layout without a displacement
 
     def converted(self, action: Tensor) -> Tensor:
-        """Convert actions (..., A) of the layout in training to actions of this layout."""
+        """Convert actions (..., A) from the training layout to this layout."""
         old, new = self.trained, self.layout
         result = action.new_zeros((*action.shape[:-1], new.action_size))
         moved = action[..., old.displaced("TransferredActor")] * (self.speed * old.reach / new.reach)

@@ -84,7 +84,7 @@ def try_plan(
 ) -> PlanCheck:
     """Decode a plan with :func:`~lw_torchrl.decode_plan`, and run it in the simulator to check its conditions.
 
-    The task must be a Meta-World task. The expert and the plan (with scripted skills) run ``episodes`` each.
+    The task must be from Meta-World. The expert and the plan (with scripted skills) run ``episodes`` episodes each.
 
     Example:
         >>> import lw_torchrl as lw

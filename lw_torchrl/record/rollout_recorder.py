@@ -32,13 +32,13 @@ class RolloutRecorder(Transform):
     When an episode ends, the recorder adds a page to the recording, with :func:`lw_torchrl.log_rollout` for a
     :class:`~lw_torchrl.LanguageWorldEnv` and with :meth:`RerunLogger.log_episode` for other environments. An episode
     that a reset or ``close()`` interrupts is recorded up to that point. Put the recorder after
-    :class:`~lw_torchrl.QAFTransform` and before transforms of the observation, and close the environment before the
+    :class:`~lw_torchrl.QAFTransform` and before observation transforms, and close the environment before the
     logger. A LanguageWorldEnv in another process cannot be recorded.
 
     Args:
         logger: the logger of the recording.
         rows: indices of the environment rows to record.
-        plans: the plans whose conditions are evaluated in ``qaf``, one for the task of each row; None without plans.
+        plans: the plans whose conditions are evaluated in ``qaf``, one for the task of each row; None for no plans.
         every: record the first and then every N-th episode of a row.
         policy: the policy's name, shown in the tab of a LanguageWorldEnv's episode.
         objects: for other environments, a function that maps a rollout (T,) to the objects to draw: name -> T×3

@@ -18,7 +18,8 @@ OVERVIEW = "overview"
 """The name of the overview tab and of the overview's entity."""
 TITLES = {kind: kind.title() for kind in ("metrics", "histograms", "images", "videos")} | {"hparams": "Hyperparameters"}
 """Titles of the tabs without episodes, by key. The keys are the first part of entity paths, so no episode may have such
-a name."""
+a name.
+"""
 ON_METRIC_TIMELINE = {"metrics", "histograms", "images"}
 _PROPERTY = "layout"
 
@@ -54,7 +55,8 @@ class Tabs:
 
     def add(self, kind: str, content: Any) -> None:
         """Add content of one ``kind``: an episode's "page", a "compare" tab (a title and the names of the episodes to
-        compare), a "figure" in the overview, or a "view" of logged values."""
+        compare), a "figure" in the overview, or a "view" of logged values.
+        """
         self._entries.append(json.dumps([kind, content]))
         if kind == "page":
             self.pages[content["row"]["name"]] = Page(**content)
@@ -93,7 +95,7 @@ class Tabs:
 
     @property
     def has_grown(self) -> bool:
-        """Whether the number of entries has grown by at least a quarter since the last :meth:`send`."""
+        """Return whether the number of entries has grown by at least a quarter since the last :meth:`send`."""
         return 4 * (len(self._entries) - self._sent) >= self._sent
 
     def send(self, stream: Any) -> None:
@@ -118,7 +120,7 @@ class Tabs:
         return rrb.Blueprint(rrb.Tabs(*(tab.view() for tab in tabs), active_tab=active), *panels, auto_views=False)
 
     def tabs(self) -> list[Tab]:
-        """Return the tabs from left to right. The tabs of a training run come before a large number of episodes."""
+        """Return the tabs from left to right. If there are many episodes, the tabs of a training run come first."""
         pages, has_overview = list(self.pages.values()), self._has_overview()
         if has_overview:
             pages.sort(key=lambda page: _order(page.row))
@@ -162,7 +164,8 @@ class Tabs:
 
     def opening_step(self, tab: str | None = None) -> int | None:
         """Return the time step at which a tab opens: the earliest decisive step of the tab's episodes, or None if the
-        tab has no episodes."""
+        tab has no episodes.
+        """
         return min((self.pages[name].decisive for name in self.tab(tab).episodes), default=None)
 
     def index(self, name: str | None) -> int:
@@ -202,7 +205,8 @@ def _order(row: dict[str, Any]) -> tuple[Any, ...]:
 
 def overview(rows: Iterable[dict[str, Any]]) -> str:
     """Return a Markdown text with the counts of failures and causes, and a table with one row per episode, failures
-    first."""
+    first.
+    """
     rows = sorted(rows, key=_order)
     ended = Counter(row["ended"] for row in rows)
     causes = Counter(row["cause"] for row in rows if row["cause"])

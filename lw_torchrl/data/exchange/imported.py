@@ -156,7 +156,7 @@ def write_dataset(
     out: Path,
     exported_as: Path | None = None,
 ) -> Demonstrations:
-    """Write rows as the described dataset, atomically, with one episode for each (start, end) in ``spans``.
+    """Write rows atomically as a dataset with this description; each (start, end) in ``spans`` is an episode.
 
     If the rows come from an exported dataset (``exported_as``), they must match the checksums in the description.
     """

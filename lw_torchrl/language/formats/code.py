@@ -128,7 +128,7 @@ class _Module:
         return function.id if isinstance(function, ast.Name) and function.id in self.functions else ""
 
     def section(self, task: str, line: int, body: Sequence[ast.stmt], roots: set[str]) -> None:
-        """Add a section with the tree of some statements, which leaves out calls of the functions ``roots``."""
+        """Add a section with the tree of the given statements, without calls to the functions in ``roots``."""
         tree = _Scope(self, {}, roots).block(body)
         if next(actions_of(tree), None) is not None:
             self.reading.add_tree(task, line, tree)

@@ -123,7 +123,7 @@ class _Tree:
         return self.start + 1 + self.text.count("\n", 0, self.at)
 
     def node(self, value: Any, is_rule_list: bool = False) -> Node | None:
-        """Convert a value to a program; None for a value without actions and conditions."""
+        """Convert a value to a program, or return None if it has neither actions nor conditions."""
         self.count += 1
         if self.count > _MOST_VALUES:
             raise ValueError("too many values")

@@ -95,7 +95,7 @@ class CompiledRows:
                 described[name] = value
 
     def forget(self, rows: Index) -> None:
-        """Let the next step of these rows, which were reset, not reuse the last step's ``mj_forward``."""
+        """Prevent the next step of these rows, which were reset, from reusing the last step's ``mj_forward``."""
         self._table["looked"][rows] = False
 
     def simulate(
@@ -103,7 +103,8 @@ class CompiledRows:
     ) -> Mask:
         """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
         ``run(call, helpers)`` runs ``call`` in this thread, where it ends when all rows are done, and in at most
-        ``helpers`` others."""
+        ``helpers`` others.
+        """
         group = self._group[rows]
         seconds = np.bincount(group, self._table["seconds"][rows]) / np.maximum(np.bincount(group), 1)
         order = np.argsort(-seconds[group], kind="stable")  # the slowest group first

@@ -43,7 +43,8 @@ MATRIX_OF = "matrix of "
 
 class StateView:
     """A flat view of all arrays of a MuJoCo state, which share one block of memory. A single ``take`` can read from all
-    arrays; concatenating ten small arrays would take four times as long. The state must outlive this view."""
+    arrays; concatenating ten small arrays would take four times as long. The state must outlive this view.
+    """
 
     def __init__(self, model: Any, data: Any) -> None:
         self._model = model
@@ -59,7 +60,8 @@ class StateView:
 
     def find(self, what: str) -> Index:
         """Return the indices in ``numbers`` of a named quantity: the position (3) of "body NAME", "geom NAME" or "site
-        NAME"; "matrix of geom NAME" (9), or of a body or site; "quaternion of body NAME" (4); or "joint NAME" (1)."""
+        NAME"; "matrix of geom NAME" (9), or of a body or site; "quaternion of body NAME" (4); or "joint NAME" (1).
+        """
         kind, _, name = what.rpartition(" ")
         if kind not in self._arrays:
             raise ValueError(f"what must be a name after one of {', '.join(self._arrays)}, got {what!r}")
@@ -113,7 +115,8 @@ DIAL_RADIUS = 0.05  # metres
 
 class Observer:
     """An observation builder for a fixed set of rows. It does Meta-World's operations in Meta-World's order, so the
-    results are bit-identical."""
+    results are bit-identical.
+    """
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
         self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])
@@ -149,13 +152,15 @@ class Observer:
 
 def row_norm(vectors: Array) -> Array:
     """Return the Euclidean norm of each row, bit-identical to calling ``np.linalg.norm`` on that row. Both use the BLAS
-    dot product; summing squares over an axis would round differently for one row in nine."""
+    dot product; summing squares over an axis would round differently for one row in nine.
+    """
     return np.sqrt(np.vecdot(vectors, vectors))
 
 
 def quaternion_of_matrix(matrix: Array) -> Array:
     """Convert rotation matrices (n, 9) to quaternions (n, 4) in x, y, z, w order. The result is bit-identical to
-    SciPy's ``Rotation.from_matrix(...).as_quat()``, which is much slower."""
+    SciPy's ``Rotation.from_matrix(...).as_quat()``, which is much slower.
+    """
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.T
     trace = m00 + m11 + m22
     quaternion = np.stack((m21 - m12, m02 - m20, m10 - m01, 1.0 + trace))
@@ -169,8 +174,10 @@ def quaternion_of_matrix(matrix: Array) -> Array:
 
 
 def _quaternion_of_tilted(matrix: Array, trace: Array) -> Array:
-    """Convert rotation matrices (n, 3, 3) to unnormalized quaternions (n, 4) in x, y, z, w order, if w is not the
-    largest component."""
+    """Convert rotation matrices (n, 3, 3) to unnormalized quaternions (n, 4) in x, y, z, w order.
+
+    w must not be the largest component.
+    """
     row, i = np.arange(len(matrix)), np.diagonal(matrix, axis1=1, axis2=2).argmax(axis=1)
     j, k = (i + 1) % 3, (i + 2) % 3
     quaternion = np.empty((len(matrix), 4))
@@ -183,7 +190,8 @@ def _quaternion_of_tilted(matrix: Array, trace: Array) -> Array:
 
 class Scene(NamedTuple):
     """The inputs of a success rule: whether each row's point is near the goal (rows,), sensors (rows, WIDTH), the first
-    18 values of the observations (rows, 18), goals (rows, 3), and points (rows, 3) that must reach the goals."""
+    18 values of the observations (rows, 18), goals (rows, 3), and points (rows, 3) that must reach the goals.
+    """
 
     near: Mask
     sensors: Array
@@ -199,7 +207,8 @@ STICK_UPWARD = 0.06
 
 class SuccessFunction:
     """A callable that computes the success of a fixed set of rows. ``programs`` maps a row to its current
-    :class:`TaskProgram`, for the one rule that reads contacts."""
+    :class:`TaskProgram`, for the one rule that reads contacts.
+    """
 
     def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:
         success = [row.success for row in sources]
