@@ -247,7 +247,8 @@ class RerunLogger(Logger):
         # With a full disk, Rerun may wait forever for its writing thread, which has ended, here and at exit.
         closing = threading.Thread(target=self.experiment.disconnect, daemon=True)
         closing.start()
-        closing.join(FLUSH_SECONDS if timeout is None else timeout)
+        wait = FLUSH_SECONDS if timeout is None else timeout
+        closing.join(wait if self.connect is None else wait + 4 * FLUSH_SECONDS)  # Rerun tries to connect once more
         if closing.is_alive():
             rr.unregister_shutdown()
         if self.path is not None and not is_complete(self.path):
