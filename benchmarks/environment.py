@@ -18,9 +18,9 @@ from torchrl.envs import Compose, EnvBase, StepCounter, TransformedEnv
 
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings, Skipped, bars, compare, part_of, take_turns, timed, under
+from lw_torchrl._util.workers import available_cores
 from lw_torchrl.suites.engine import Engine, EngineStep
 from lw_torchrl.suites.metaworld.plain_engine import make_metaworld_env
-from lw_torchrl.suites.metaworld.simulated_rows import available_cores
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 _SMALL = ("reach", "push", "door-open")

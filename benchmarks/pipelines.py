@@ -10,7 +10,7 @@ import torch
 
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings, timed, under
-from lw_torchrl.suites.metaworld.simulated_rows import available_cores
+from lw_torchrl._util.workers import available_cores
 
 
 def _size(settings: Settings, full: int) -> tuple[tuple[str, ...], int, int]:

@@ -33,7 +33,7 @@ import lw_torchrl as lw
 from benchmarks.paper.actors import Parts
 from benchmarks.paper.stacked import StackedBehavioralCloning
 from lw_torchrl._util.files import write_json
-from lw_torchrl.suites.metaworld.simulated_rows import available_cores
+from lw_torchrl._util.workers import available_cores
 from lw_torchrl.training.loop import Training
 from lw_torchrl.training.offline import DISTRIBUTIONS, GAMMA, N_STEPS, make_loss
 

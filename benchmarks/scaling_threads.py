@@ -17,6 +17,7 @@ import torch
 
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings
+from lw_torchrl._util.workers import available_cores
 from lw_torchrl.suites.metaworld import simulated_rows
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
@@ -40,7 +41,7 @@ def rows(threads: Sequence[int], sizes: Sequence[int] = (50, 400), seconds: floa
 
 def threads(settings: Settings) -> list[Row]:
     """1, 2, 4, 8 and 16 threads, as far as there are cores, against as many processes and against one thread."""
-    counts = [count for count in (1, 2, 4, 8, 16) if count <= simulated_rows.available_cores()]
+    counts = [count for count in (1, 2, 4, 8, 16) if count <= available_cores()]
     found = rows(counts, (5,) if settings.quick else (50, 400), seconds=0.02 if settings.quick else 0.5)
     lines = []
     for line in found:
@@ -179,6 +180,6 @@ def _one_process(barrier: Any, rates: Any, seconds: float) -> None:
 
 
 if __name__ == "__main__":
-    cores = simulated_rows.available_cores()
+    cores = available_cores()
     for line in rows([count for count in (1, 2, 4, 8, 16) if count <= cores]):
         print(line, flush=True)

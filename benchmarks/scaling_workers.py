@@ -11,7 +11,7 @@ import torch
 
 import lw_torchrl as lw
 from benchmarks.report import timed
-from lw_torchrl.suites.metaworld.simulated_rows import available_cores
+from lw_torchrl._util.workers import available_cores
 
 EPISODES = 500
 

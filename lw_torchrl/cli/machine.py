@@ -13,10 +13,10 @@ from typing import Any
 
 import torch
 
+from lw_torchrl._util.workers import available_cores
 from lw_torchrl.cli.options import Output
 from lw_torchrl.language.query_program import find_kernel
 from lw_torchrl.suites.cameras import Cameras
-from lw_torchrl.suites.metaworld.simulated_rows import available_cores
 
 _PACKAGES = ("lw_torchrl", "torch", "torchrl", "tensordict", "mujoco", "metaworld", "numpy", "rerun-sdk")
 _VARIABLES = (

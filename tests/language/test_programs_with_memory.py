@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from conditions import visit_with_memory
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -64,16 +65,7 @@ class Ticker:
 
 
 def active_steps(guards: list[Expression], truth: dict[str, bool], latched: set[Once]) -> list[bool]:
-    def visit(each: Expression, parts: list[bool]) -> bool:
-        if each.kind != "leaf":
-            return all(parts) if each.kind == "all" else any(parts)
-        if not isinstance(each.leaf, Once):
-            return truth[each.leaf] != each.negated
-        if fold(each.leaf.condition, visit):
-            latched.add(each.leaf)
-        return (each.leaf in latched) != each.negated
-
-    return [fold(guard, visit) for guard in guards]
+    return [fold(guard, visit_with_memory(truth, latched)) for guard in guards]
 
 
 @given(trees, st.lists(st.fixed_dictionaries({name: st.booleans() for name in FACTS}), max_size=8))

@@ -7,6 +7,7 @@ from functools import partial
 
 import pytest
 import torch
+from conditions import visit_with_memory
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
@@ -72,16 +73,7 @@ class Interpreter:
         truth = torch.zeros(len(observation), self.steps, dtype=torch.bool)
         for step, values in enumerate(facts):
             state = dict(zip(self.clauses[task], values, strict=True))
-
-            def visit(each: Expression, parts: list[bool], state: dict[Clause, bool] = state) -> bool:
-                if each.kind != "leaf":
-                    return all(parts) if each.kind == "all" else any(parts)
-                if not isinstance(each.leaf, Once):
-                    return state[each.leaf] != each.negated
-                if fold(each.leaf.condition, visit):
-                    latched.add(each.leaf)
-                return (each.leaf in latched) != each.negated
-
+            visit = visit_with_memory(state, latched)
             answers = [fold(condition, visit) for condition in self.conditions[task]]
             truth[step, : len(answers)] = torch.tensor(answers)
         return truth

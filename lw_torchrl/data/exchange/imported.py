@@ -10,7 +10,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,7 +26,7 @@ from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations, EpisodeInfo
 from lw_torchrl.data.exchange import reader
-from lw_torchrl.data.exchange.table import ABOUT, KEYS, WIDE, Array
+from lw_torchrl.data.exchange.table import ABOUT, KEYS, WIDE, Array, EpisodeRows
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.suites.suite import Suite
@@ -39,7 +39,7 @@ class ExchangeError(DatasetError):
 
 
 @dataclass(frozen=True)
-class ImportedTable:
+class ImportedTable(EpisodeRows):
     """The rows of consecutive episodes in another format's files.
 
     Attributes:
@@ -57,14 +57,6 @@ class ImportedTable:
     ends_known: bool
     unfit: Mapping[str, str]
     notes: tuple[str, ...]
-
-    @property
-    def rows(self) -> int:
-        return sum(self.lengths)
-
-    def spans(self) -> Iterator[tuple[int, int]]:
-        """Yield the start row and the end row (exclusive) of each episode."""
-        return pairwise(accumulate(self.lengths, initial=0))
 
     def explain(self, name: str) -> str:
         """Return the end of a warning for a missing column: the column whose size does not fit."""

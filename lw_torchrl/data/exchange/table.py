@@ -32,8 +32,22 @@ ABOUT = "lw_torchrl"  # the name of the dataset's metadata in exported files
 _BLOCK = 50_000  # number of rows whose conditions are evaluated at once
 
 
+class EpisodeRows:
+    """Rows of several episodes, one episode after another."""
+
+    lengths: tuple[int, ...]  # rows of each episode
+
+    @property
+    def rows(self) -> int:
+        return sum(self.lengths)
+
+    def spans(self) -> Iterator[tuple[int, int]]:
+        """Yield the start row and the end row (exclusive) of each episode."""
+        return pairwise(accumulate(self.lengths, initial=0))
+
+
 @dataclass(frozen=True)
-class Table:
+class Table(EpisodeRows):
     """The rows of consecutive episodes to export.
 
     Attributes:
@@ -52,14 +66,6 @@ class Table:
     metadata: Mapping[str, Any]
     demonstrations: Demonstrations
     fps: int
-
-    @property
-    def rows(self) -> int:
-        return sum(self.lengths)
-
-    def spans(self) -> Iterator[tuple[int, int]]:
-        """Yield the start row and the end row (exclusive) of each episode."""
-        return pairwise(accumulate(self.lengths, initial=0))
 
     def repeat(self, values: Any) -> Array:
         """Repeat each episode's value for every row of the episode."""

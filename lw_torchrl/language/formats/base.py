@@ -156,7 +156,7 @@ _FENCE = re.compile(r"^[ \t]*(?:```|~~~).*$", re.MULTILINE)
 
 
 def code_blocks(text: str) -> Iterator[tuple[int, str]]:
-    """Yield (number of lines before, text) of each fenced block, or of the whole text if there is no fence."""
+    """Yield (line offset, text) for each fenced code block, or for the whole text if it has no fence."""
     if end := END.search(text):
         text = text[: end.start()]
     fences = [(match.start(), match.end()) for match in _FENCE.finditer(text)]

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from lw_torchrl._util.workers import available_cores
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
@@ -230,10 +231,6 @@ def _stop(call: list[Callable[[], object] | None], wakes: Sequence[threading.Loc
     for wake in wakes:
         if wake.locked():
             wake.release()
-
-
-def available_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class ThreadedEngine(SeenRows):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hypothesis import strategies as st
 
-from lw_torchrl.language.expressions import all_of, any_of, negate
+from lw_torchrl.language.expressions import Once, all_of, any_of, fold, negate
 from lw_torchrl.language.queries import Query, parse_query
 
 
@@ -12,6 +12,21 @@ def trees(leaves, most=12):
     """Return a strategy of trees ("all" | "any", parts), ("not", part) or leaf, with at most ``most`` leaves."""
     joined = lambda inner: st.tuples(st.sampled_from(["all", "any"]), st.lists(inner, min_size=1, max_size=4))  # noqa: E731
     return st.recursive(leaves, lambda inner: joined(inner) | st.tuples(st.just("not"), inner), max_leaves=most)
+
+
+def visit_with_memory(truth, latched):
+    """Return a function for ``fold`` that interprets an expression, and adds the latches that become true to a set."""
+
+    def visit(each, parts):
+        if each.kind != "leaf":
+            return all(parts) if each.kind == "all" else any(parts)
+        if not isinstance(each.leaf, Once):
+            return truth[each.leaf] != each.negated
+        if fold(each.leaf.condition, visit):
+            latched.add(each.leaf)
+        return (each.leaf in latched) != each.negated
+
+    return visit
 
 
 def interpret(tree, truth):
