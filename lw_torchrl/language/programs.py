@@ -287,7 +287,9 @@ class _Compiler:
 
     def sequence(self, node: Sequence | Block, here: Expression, followed: bool, depth: int) -> _Flow:
         parts = _inlined(node)
-        waits = [number for number, part in enumerate(parts) if not isinstance(part, Jump | Label)]
+        last_wait = max((k for k, part in enumerate(parts) if not isinstance(part, Jump | Label)), default=-1)
+        last_action = max((k for k, part in enumerate(parts) if isinstance(part, Action)), default=-1)
+        last_end = max((k for k, part in enumerate(parts) if isinstance(part, Jump) and not part.label), default=-1)
         # hard: what every later part waits for; soft: what later actions wait for; done: without failed conditions.
         hard, soft, done, falls, fails, jumps = TRUE, TRUE, TRUE, TRUE, list[Expression](), dict[str, Expression]()
         for number, part in enumerate(parts):
@@ -298,9 +300,8 @@ class _Compiler:
                 continue
             is_action, beside = isinstance(part, Action), isinstance(node, Block) and isinstance(part, Branch)
             guard = all_of([here, hard, soft] if is_action or not isinstance(node, Block) else [here, hard])
-            later = [parts[other] for other in waits if other > number]
-            ends = any(isinstance(other, Jump) and not other.label for other in parts[number:])
-            stops = (followed and not ends) or any(not beside or isinstance(other, Action) for other in later)
+            is_followed = (last_action if beside else last_wait) > number
+            stops = (followed and last_end < number) or is_followed
             flow = self.run(part, guard, stops, depth)
             fails.append(all_of([done, flow.fails]))
             for label, condition in flow.jumps.items():

@@ -322,7 +322,7 @@ def test_mutated_answers_raise_nothing_and_take_little_time():
 def test_long_texts_take_linear_time(text, format):
     start = thread_time()
     lw.decode_plan(text, "stick-pull", format)
-    assert thread_time() - start < 1.0
+    assert thread_time() - start < 4.0  # a quadratic reader takes far longer
 
 
 def test_steps_beyond_the_limit_are_left_out():
