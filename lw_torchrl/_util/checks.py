@@ -109,7 +109,7 @@ def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
 
 def check_value(argument: str, value: Any, hint: Any) -> Any:
     """Return ``value`` (NumPy scalars as Python numbers) if it matches a type hint; otherwise raise an
-    :class:`ArgumentError`. A path that begins with "~/" is expanded.
+    :class:`ArgumentError`. Paths that begin with "~/" are expanded, also in lists.
     """
     if not checker(hint)(value):
         choices = [
@@ -117,9 +117,16 @@ def check_value(argument: str, value: Any, hint: Any) -> Any:
         ]
         close = did_you_mean(value, map(str, choices)) if isinstance(value, str) else ""
         raise ArgumentError(f"{argument} must be {_words(hint)}, got {shown(value)}{close}")
-    if isinstance(value, str | PathLike) and "PathLike" in str(hint) and fspath(value).startswith("~/"):
+    return _expanded(value) if "PathLike" in str(hint) else _plain(value)
+
+
+def _expanded(value: Any) -> Any:
+    """Expand "~/" at the beginning of a path, or of each path in a list or tuple."""
+    if isinstance(value, list | tuple):
+        return [*map(_expanded, value)]
+    if isinstance(value, str | PathLike) and fspath(value).startswith("~/"):
         return expanduser(value) if isinstance(value, str) else Path(expanduser(value))
-    return _plain(value)
+    return value
 
 
 def _plain(value: Any) -> Any:

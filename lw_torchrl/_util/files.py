@@ -6,6 +6,7 @@ import errno
 import glob
 import json
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -16,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from hashlib import sha256
 from importlib.resources.abc import Traversable
+from itertools import accumulate
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import IO, Any
@@ -23,6 +25,7 @@ from typing import IO, Any
 AnyPath = str | os.PathLike[str]
 _ABANDONED = 3600.0  # age in seconds at which a temporary folder counts as a leftover of a killed process
 _LONGEST = 255  # maximum number of bytes in the name of a file, in all common file systems
+_DEEPEST = 200  # maximum nesting of JSON
 PATIENCE = 1.0  # seconds that `locked` waits for another writer to finish
 
 _SHIPPED = Path(__file__).parents[1] / "training" / "data"
@@ -247,6 +250,10 @@ def parse_json(content: bytes) -> dict[str, Any]:
         raise ValueError("the JSON is nested too deeply") from None
     if not isinstance(value, dict):
         raise ValueError(f"the JSON must be an object, got {type(value).__name__}")
+    brackets = re.sub(rb'"(?:[^"\\]|\\.)*+"|[^][{}]++', b"", content)
+    steps = (1 if bracket in b"[{" else -1 for bracket in brackets)
+    if max(accumulate(steps)) > _DEEPEST:  # such objects can be parsed, but not be written or copied
+        raise ValueError("the JSON is nested too deeply")
     return value
 
 

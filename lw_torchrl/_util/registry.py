@@ -12,6 +12,7 @@ from lw_torchrl._util.checks import unknown_name
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
+Key = TypeVar("Key")
 Entry = TypeVar("Entry")
 _PLACE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
@@ -24,16 +25,16 @@ def entry_points_of(group: str) -> "dict[str, EntryPoint]":
     return {point.name: point for point in entry_points(group=group)}
 
 
-class ReadOnlyDict(Mapping[str, Entry]):
+class ReadOnlyDict(Mapping[Key, Entry]):
     """A read-only mapping that, unlike ``types.MappingProxyType``, can be pickled."""
 
-    def __init__(self, items: Mapping[str, Entry]) -> None:
+    def __init__(self, items: Mapping[Key, Entry]) -> None:
         self._items = items
 
-    def __getitem__(self, name: str) -> Entry:
+    def __getitem__(self, name: Key) -> Entry:
         return self._items[name]
 
-    def __iter__(self) -> Iterator[str]:
+    def __iter__(self) -> Iterator[Key]:
         return iter(self._items)
 
     def __len__(self) -> int:

@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
-from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from lw_torchrl._util.checks import Count, Probability, check_choice, shown, typed_fields
+from lw_torchrl._util.registry import ReadOnlyDict
 from lw_torchrl._util.reproducibility import episode_generator
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.skills import Skills
@@ -80,9 +80,7 @@ _SEGMENTS = (
     Behaviour("wrong", right=0.0),
     Behaviour("random", right=0.0, otherwise="action"),
 )
-BEHAVIOURS: Mapping[str, Behaviour] = MappingProxyType(
-    {behaviour.name: behaviour for behaviour in (EXPERT, *_SEGMENTS)}
-)
+BEHAVIOURS: Mapping[str, Behaviour] = ReadOnlyDict({behaviour.name: behaviour for behaviour in (EXPERT, *_SEGMENTS)})
 """The shipped collection policies by name: "expert" (Meta-World's script), "scripted" (scripted skills that follow the
 plan), "noisy-60" and "noisy-30" (scripted skills in 60 % or 30 % of the segments, random skills of the plan in the
 others), "wrong" (only random skills of the plan) and "random" (random actions in [-1, 1]).

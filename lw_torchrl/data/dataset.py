@@ -21,7 +21,6 @@ from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from reprlib import repr as short
-from types import MappingProxyType
 from typing import Any
 from zlib import crc32
 
@@ -33,6 +32,7 @@ from torch import Tensor
 from lw_torchrl._util.checks import Count, Scale, typed_fields
 from lw_torchrl._util.files import AnyPath, check_damage, flush, read_json, write_json
 from lw_torchrl._util.progress import Progress
+from lw_torchrl._util.registry import ReadOnlyDict
 from lw_torchrl.data.collection_policy import EXPERT, NOISY, Behaviour, check_own_label
 from lw_torchrl.envs.episodes import first_success
 from lw_torchrl.language.layout import METAWORLD, Layout
@@ -220,7 +220,7 @@ Column = tuple[str, ...]
 def columns_of(layout: Layout) -> Mapping[Column, tuple[tuple[int, ...], torch.dtype]]:
     """Return the columns of a dataset, with the shape and dtype of one row."""
     observation, action = ((layout.size,), torch.float32), ((layout.action_size,), torch.float32)
-    return MappingProxyType(
+    return ReadOnlyDict(
         {
             ("observation",): observation,
             ("task_id",): ((), torch.int64),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Literal
 
 import torch
@@ -12,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._util.checks import Count, Probability, typed
+from lw_torchrl._util.registry import ReadOnlyDict
 from lw_torchrl.data.dataset import DONE, REWARD, TRAJECTORY
 
 RewardName = Literal["sparse", "dense", "cost", "dense_cost"]
@@ -40,7 +40,7 @@ class Reward:
         return reward if self.at_success is None else torch.where(success, self.at_success, reward)
 
 
-REWARDS: Mapping[RewardName, Reward] = MappingProxyType(
+REWARDS: Mapping[RewardName, Reward] = ReadOnlyDict(
     {
         "sparse": Reward("sparse"),
         "dense": Reward("dense"),

@@ -5,12 +5,11 @@ from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
-from types import MappingProxyType
 from typing import Any, Literal
 
 from lw_torchrl._util.checks import Finite, Positive, shown, typed_fields
 from lw_torchrl._util.files import read_toml
-from lw_torchrl._util.registry import Registry
+from lw_torchrl._util.registry import ReadOnlyDict, Registry
 from lw_torchrl.language.connectives import CONNECTIVES
 from lw_torchrl.language.layout import Layout
 
@@ -71,7 +70,7 @@ def _check_state(name: str, parts: Any) -> tuple[Comparison, ...]:
     return tuple(parts)
 
 
-_OF_POSITION: Mapping[str, tuple[Comparison, ...]] = MappingProxyType(_predicates("unary"))
+_OF_POSITION: Mapping[str, tuple[Comparison, ...]] = ReadOnlyDict(_predicates("unary"))
 STATES = Registry("state", "lw_torchrl.states", _predicates("states"), _check_state)
 """The states of an opening, from 0 (closed) to 1 (open); their comparisons use the opening as z.
 

@@ -171,7 +171,7 @@ class ChatClient:
         """Name the environment variables that change how the server is reached; "" if none is set."""
         names = [name for name in _VARIABLES if os.environ.get(name) or os.environ.get(name.lower())]
         if self._is_local:
-            names = [name for name in names if name in _PROXIES]
+            names = [name for name in names if name in _PROXIES or not self.address.startswith("https")]
         ignored = ", ignored for a server on this machine" if self._is_local else ""
         return f" (set in the environment: {', '.join(names)}{ignored})" if names else ""
 

@@ -19,12 +19,12 @@ from urllib.parse import quote
 
 from lw_torchrl._util.checks import Natural, typed
 from lw_torchrl._util.files import AnyPath, replacing
+from lw_torchrl._util.limits import run_limited
 from lw_torchrl.record.entities import EPISODE_TIMELINE
+from lw_torchrl.record.own_host import LOCAL, START_SECONDS, forwarded, hidden_address
 from lw_torchrl.record.rerun_logger import is_complete
 from lw_torchrl.record.tabs import Tabs
 
-LOCAL = "127.0.0.1"
-START_SECONDS = 60.0
 PAINT_SECONDS, SETTLE_SECONDS = 0.7, 15.0
 REASONS = {
     r"render context|[Nn]o (graphics|wgpu) adapter|libvulkan": "no graphics driver was found. Without a GPU, install "
@@ -60,7 +60,8 @@ def open_viewer(
         episode: the tab to open, by title ("Metrics") or episode name, in each recording that has it; None opens the
             first tab.
         web_port: serve Rerun's web viewer on this port of 127.0.0.1 until Ctrl-C, instead of opening a window, and
-            print the address; 0 picks a free port. The web viewer opens at its own default step.
+            print the address; 0 picks a free port. Requests for other host names are rejected. The web viewer opens at
+            its own default step.
 
     Raises:
         FileNotFoundError: the file does not exist, or the Rerun viewer is not installed.
@@ -109,9 +110,12 @@ def open_viewer(
         port = str(free_port())
         arguments: list[str | Path] = [*files, *layouts, "--port", port]
         if web_port is not None:
-            web = str(web_port or free_port())
-            process, output = stack.enter_context(rerun_process(*arguments, "--serve-web", "--web-viewer-port", web))
-            print(f"http://{LOCAL}:{web}/?url={quote(f'rerun+http://{LOCAL}:{port}/proxy', '')}", flush=True)
+            address, web = hidden_address(), free_port()
+            page = stack.enter_context(forwarded(web_port, (address, web)))
+            data = stack.enter_context(forwarded(0, (address, int(port))))
+            arguments += ["--serve-web", "--web-viewer-port", str(web), "--bind", address]
+            process, output = stack.enter_context(rerun_process(*arguments))
+            print(f"http://{LOCAL}:{page}/?url={quote(f'rerun+http://{LOCAL}:{data}/proxy', '')}", flush=True)
         elif screenshot is None:
             process, output = stack.enter_context(rerun_process(*arguments, "--window-size", window_size))
             with suppress(ConnectionError, TimeoutError):  # the user may have closed the window immediately
@@ -161,21 +165,37 @@ def damaged(recording: Path) -> Iterator[None]:
 @contextmanager
 def readable(recording: Path) -> Iterator[Path]:
     """Yield the path of a recording, or of a repaired copy if the recording was not closed properly; otherwise Rerun
-    would wait for the rest of the incomplete file.
+    would wait for the rest of the incomplete file. A child process reads the file first, because Rerun trusts the sizes
+    that a file declares.
     """
-    from rerun.chunk import RrdReader
-
-    if is_complete(recording):
-        yield recording
-        return
-    warnings.warn(f"recording {str(recording)!r} was not closed; it is shown as far as it was written", stacklevel=4)
     with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / recording.name
-        command = [rerun_program(), "rrd", "merge", str(recording), "-o", str(copy)]
-        merge = subprocess.run(command, capture_output=True, check=False)
-        if merge.returncode or not RrdReader(copy).recordings():
-            raise ValueError(f"{str(recording)!r} is not a Rerun recording, or is empty")
-        yield copy
+        file = recording
+        if not is_complete(recording):
+            message = f"recording {str(recording)!r} was not closed; it is shown as far as it was written"
+            warnings.warn(message, stacklevel=4)
+            file = Path(folder) / recording.name
+            _check(recording, rerun_program(), "rrd", "merge", recording, "-o", file)
+        _check(recording, sys.executable, "-P", "-c", _READ, file)
+        yield file
+
+
+_READ = """
+import sys
+from rerun.chunk import RrdReader
+reader = RrdReader(sys.argv[1])
+for _ in reader.stream():
+    pass
+sys.exit(None if reader.recordings() else "it is empty")
+"""
+
+
+def _check(recording: Path, *command: str | Path) -> None:
+    """Raise a :class:`ValueError` if a command that reads a recording fails, or exceeds its limits."""
+    with damaged(recording):
+        done = run_limited(command, recording.stat().st_size)
+    if done.returncode:
+        reason = done.stderr.decode("utf-8", "replace").strip().splitlines()[-1:]
+        raise ValueError(f"{str(recording)!r} is not a Rerun recording, or is damaged ({''.join(reason)})")
 
 
 class Opening(NamedTuple):
@@ -274,7 +294,7 @@ def free_port() -> int:
 def rerun_process(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[bytes], IO[bytes]]]:
     """Run the ``rerun`` executable until the block ends; yield the process and a file with the process's output."""
     with tempfile.TemporaryFile() as output:
-        command = [rerun_program(), *map(str, arguments), "--bind", LOCAL]
+        command = [rerun_program(), *map(str, arguments), *([] if "--bind" in arguments else ["--bind", LOCAL])]
         # The viewer's messages about software rendering would cover the screenshot.
         quiet = {"RUST_LOG": "error"} if "--headless" in command else {}
         process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=quiet | dict(os.environ))

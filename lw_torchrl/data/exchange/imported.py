@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,6 +19,7 @@ from tensordict import TensorDict
 
 from lw_torchrl._util.checks import shown, unknown_name
 from lw_torchrl._util.files import replacing_folder
+from lw_torchrl._util.limits import LimitError, allowed_bytes, run_limited
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour
@@ -30,8 +29,6 @@ from lw_torchrl.data.exchange.table import ABOUT, KEYS, WIDE, Array, EpisodeRows
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.suites.suite import Suite
-
-_SECONDS, _BYTES_PER_SECOND = 30, 1e6  # time limit of the child process: a constant, and a part for the files' size
 
 
 class ExchangeError(DatasetError):
@@ -69,28 +66,16 @@ def read_files(source: Path, is_hdf5: bool, layout: Layout) -> ImportedTable:
     order = [name for name in reader.NAMES if name in widths]
     stored = reader.stored_bytes(reader.data_files(source, reader.HDF5 if is_hdf5 else reader.PARQUET))
     with TemporaryDirectory() as folder:
-        argument = json.dumps({name: widths[name] for name in order})
-        command = [
-            sys.executable,
-            "-P",
-            reader.__file__,
-            str(source.absolute()),
-            folder,
-            "hdf5" if is_hdf5 else "parquet",
-            argument,
-        ]
-        seconds = _SECONDS + stored / _BYTES_PER_SECOND
-        environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        argument = json.dumps([is_hdf5, allowed_bytes(stored), {name: widths[name] for name in order}])
+        command = [sys.executable, "-P", reader.__file__, str(source.absolute()), folder, argument]
         try:
-            done = subprocess.run(
-                command, env=environment, capture_output=True, timeout=seconds, stdin=subprocess.DEVNULL
-            )
-        except subprocess.TimeoutExpired:
-            raise ExchangeError(f"reading {stored:,} bytes took more than {seconds:.0f} s, so it was stopped") from None
+            done = run_limited(command, stored)
+        except LimitError as error:
+            raise ExchangeError(str(error)) from None
         report = Path(folder, "table.json")
         if done.returncode or not report.is_file():
             last = done.stderr.decode("utf-8", "replace").strip().splitlines()[-1:]
-            raise ExchangeError(f"reading failed within its limit of memory (exit status {done.returncode}; {last})")
+            raise ExchangeError(f"reading failed (exit status {done.returncode}; {last})")
         table: dict[str, Any] = json.loads(report.read_text("utf-8"))
         if "refused" in table:
             raise ExchangeError(table["refused"])

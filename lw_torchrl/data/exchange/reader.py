@@ -87,11 +87,6 @@ def stored_bytes(paths: Iterable[Path]) -> int:
     return sum(min(state.st_size, state.st_blocks * 512) for state in states)
 
 
-def allowed_bytes(stored: int) -> int:
-    """Return how many bytes of numbers files of a size may declare: compressed files are smaller than their numbers."""
-    return 100 * _MB + 50 * stored
-
-
 class Files:
     """The episodes that :func:`read_parquet` or :func:`read_hdf5` reads, and the columns to read.
 
@@ -545,23 +540,18 @@ def _report(out: Path, **values: Any) -> None:
     (out / "table.json").write_text(json.dumps(values), encoding="utf-8")
 
 
-def main(source: Path, out: Path, kind: str, widths: Mapping[str, int]) -> None:
+def main(source: Path, out: Path, is_hdf5: bool, allowed: int, widths: Mapping[str, int]) -> None:
     """Read files, and write the columns or the error to the folder ``out``."""
-    import resource
-
     try:
-        stored = stored_bytes(data_files(source, HDF5 if kind == "hdf5" else PARQUET))
-        files = Files(widths, allowed_bytes(stored))
-        memory = 300 * _MB + 4 * files.allowed
-        resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
-        (read_hdf5 if kind == "hdf5" else read_parquet)(source, files)
+        files = Files(widths, allowed)
+        (read_hdf5 if is_hdf5 else read_parquet)(source, files)
         files.save(out)
     except Refused as error:
         _report(out, refused=str(error))
     except ImportError as error:
         _report(out, missing=error.name)
     except MemoryError:
-        _report(out, refused=f"the files declare more than {memory / _MB:,.0f} MB, too much for files of this size")
+        _report(out, refused="the files declare more memory than is available for files of this size")
     except OSError as error:
         if error.errno is None:
             _report(out, corrupted=f"{type(error).__name__}: {error}")
@@ -574,4 +564,4 @@ def main(source: Path, out: Path, kind: str, widths: Mapping[str, int]) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], json.loads(sys.argv[4]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), *json.loads(sys.argv[3]))

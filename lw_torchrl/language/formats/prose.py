@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from lw_torchrl._util.checks import shown
-from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item
+from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, Styled, item
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, one_line
 from lw_torchrl.language.tasks import TASKS, Task
@@ -17,12 +17,13 @@ def md(style: Style) -> PlanFormat:
     Source: paper section 'Conditional Plan Generation', which compared plans in prose with plans in code.
     """
 
-    def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
-        about = "A robot that has one arm with a gripper does each task by the rules below it.\n"
-        hint = "".join(f"{line}\n" for line in hints)
-        return "\n".join([about, *(_write(plan, style) for plan in examples), hint + _opening(task)])
+    return PlanFormat("md", Styled(_write, style), ProseReading, Styled(_prompt, style), style)
 
-    return PlanFormat("md", lambda plan: _write(plan, style), ProseReading, prompt, style)
+
+def _prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str], style: Style) -> str:
+    about = "A robot that has one arm with a gripper does each task by the rules below it.\n"
+    hint = "".join(f"{line}\n" for line in hints)
+    return "\n".join([about, *(_write(plan, style) for plan in examples), hint + _opening(task)])
 
 
 def _opening(task: Task) -> str:

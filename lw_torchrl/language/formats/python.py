@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from lw_torchrl._util.checks import shown
-from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item, task_name
+from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, Styled, item, task_name
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep, function_head, one_line, quote
 from lw_torchrl.language.queries import Query
@@ -22,11 +22,12 @@ def py(style: Style) -> PlanFormat:
     Source: paper section 'Conditional Plan Generation' and its figure of a plan.
     """
 
-    def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
-        hint = "".join(f"# {line}\n" for line in hints)
-        return "\n".join([*(_write(plan, style) for plan in examples), hint + function_head(task)])
+    return PlanFormat("py", Styled(_write, style), PythonReading, Styled(_prompt, style), style)
 
-    return PlanFormat("py", lambda plan: _write(plan, style), PythonReading, prompt, style)
+
+def _prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str], style: Style) -> str:
+    hint = "".join(f"# {line}\n" for line in hints)
+    return "\n".join([*(_write(plan, style) for plan in examples), hint + function_head(task)])
 
 
 def _write(plan: ConditionalPlan, style: Style) -> str:
@@ -60,25 +61,27 @@ _HELD = {"": "", _OPENED: ", open_gripper=True", _CLOSED: ", close_gripper=True"
 
 def py_md(style: Style) -> PlanFormat:
     """Build the format that writes a plan as a chat message with the function in a fenced code block."""
+    return PlanFormat("md", Styled(_write_message, style), PythonReading, Styled(_prompt_message, style), style)
 
-    def fenced(code: str) -> str:
-        return f"```python\n{code}```\n"
 
-    def encode(plan: ConditionalPlan) -> str:
-        return f"This function does the task `{plan.task}`:\n\n{fenced(_write(plan, style))}"
+def _fenced(code: str) -> str:
+    return f"```python\n{code}```\n"
 
-    def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
-        return (
-            "I control a robot that has one arm with a gripper. A function says what the robot does: each `if` asks "
-            "about the state, and its skill is carried out while the answer is yes. These functions do other tasks:\n\n"
-            + fenced("\n".join(_write(plan, style) for plan in examples))
-            + "".join(f"\n{line}" for line in hints)
-            + ("\n" if hints else "")
-            + f"\nPlease write the function for `{task.name}` in the same way, the whole of it in one block:\n\n"
-            + fenced(function_head(task))
-        )
 
-    return PlanFormat("md", encode, PythonReading, prompt, style)
+def _write_message(plan: ConditionalPlan, style: Style) -> str:
+    return f"This function does the task `{plan.task}`:\n\n{_fenced(_write(plan, style))}"
+
+
+def _prompt_message(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str], style: Style) -> str:
+    return (
+        "I control a robot that has one arm with a gripper. A function says what the robot does: each `if` asks "
+        "about the state, and its skill is carried out while the answer is yes. These functions do other tasks:\n\n"
+        + _fenced("\n".join(_write(plan, style) for plan in examples))
+        + "".join(f"\n{line}" for line in hints)
+        + ("\n" if hints else "")
+        + f"\nPlease write the function for `{task.name}` in the same way, the whole of it in one block:\n\n"
+        + _fenced(function_head(task))
+    )
 
 
 # A Python string with any prefix. Possessive quantifiers (*+) keep the time linear for malformed text.

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 from math import inf, nan
-from types import MappingProxyType
 from typing import Any, Literal
+
+from lw_torchrl._util.registry import ReadOnlyDict
 
 Vector = tuple[float, float, float]
 Pair = tuple[float, float]
@@ -160,7 +161,7 @@ def _read(file: str, task: Any, parts: Mapping[str, Any]) -> Mapping[str, Any]:
     for name, entry in tomllib.loads(text).items():
         own_parts = {key: parts[key](**plain(entry.pop(key))) for key in parts.keys() & entry.keys()}
         tasks[name] = task(**plain(entry), **own_parts)
-    return MappingProxyType(tasks)
+    return ReadOnlyDict(tasks)
 
 
 @cache
