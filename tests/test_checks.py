@@ -10,6 +10,7 @@ import random
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ import torch
 
 import lw_torchrl as lw
 from lw_torchrl._util.checks import Count, Natural, Positive, Probability, Scale, check_value, typed, typed_fields
+from lw_torchrl._util.files import AnyPath
 
 
 @typed
@@ -135,3 +137,11 @@ def test_annotations_of_checked_functions_can_be_read():
             function.__annotations__[name] for name in function.__annotations__.keys() - hints.keys() - {"return"}
         }
     assert unread <= {"AnyPlans", "Layout", "Layout | None"}
+
+
+def test_a_home_folder_is_expanded_in_lists_of_paths(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/somebody")
+    given = ["~/a", Path("~/b"), "c~/d", "~"]
+    for hint in (AnyPath | Iterable[AnyPath], Sequence[AnyPath] | None):
+        assert check_value("root", given, hint) == ["/home/somebody/a", Path("/home/somebody/b"), "c~/d", "~"]
+    assert check_value("names", given[:1], Sequence[str]) == ["~/a"]

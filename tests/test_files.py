@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -15,6 +16,7 @@ from contextlib import suppress
 import pytest
 
 from lw_torchrl._util import files as _files
+from lw_torchrl._util import limits
 from lw_torchrl._util.files import (
     locked,
     read_json,
@@ -25,6 +27,8 @@ from lw_torchrl._util.files import (
     write_json,
     write_text,
 )
+from lw_torchrl._util.limits import LimitError, run_limited
+from lw_torchrl._util.tensor_files import read_tensors
 
 
 class OwnError(ValueError):
@@ -320,3 +324,32 @@ def test_written_json_is_read_back(tmp_path):
     assert read_json(tmp_path / "a.json", "it") == value
     with pytest.raises(FileNotFoundError, match=r"nowhere\.json"):
         read_json(tmp_path / "nowhere.json", "it")
+
+
+# ---- limits
+
+
+def test_a_program_within_its_limits_returns_its_status_and_output():
+    done = run_limited([sys.executable, "-c", "import sys; print('read'); sys.exit('odd')"], 10)
+    assert (done.returncode, done.stdout, done.stderr) == (1, b"read\n", b"odd\n")
+
+
+def test_a_program_that_never_ends_is_stopped(monkeypatch):
+    monkeypatch.setattr(limits, "_SECONDS", 1)
+    with pytest.raises(LimitError, match="took more than 1 s"):
+        run_limited([sys.executable, "-c", "while True: pass"], 10)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs limits of memory")
+def test_a_program_that_takes_too_much_memory_fails():
+    done = run_limited([sys.executable, "-c", "bytes(10**9)"], 10)
+    assert b"MemoryError" in done.stderr
+
+
+@pytest.mark.parametrize("depth", [199, 250, 900])
+def test_json_that_is_nested_deeply_is_invalid_also_in_a_policy(tmp_path, depth):
+    nested = b'{"a": "[{", "b": ' + b"[" * depth + b"]" * depth + b"}"
+    header = json.dumps({"__metadata__": {"lw_torchrl": nested.decode()}}).encode()
+    (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header)
+    with pytest.raises(ValueError, match="not written by lw_torchrl" if depth < 200 else "nested too deeply"):
+        read_tensors(tmp_path / "a.safetensors")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
+import pickle
 import sys
 
 import pytest
@@ -128,3 +130,17 @@ def test_string_is_imported_at_its_first_use():
 def test_methods_must_be_functions():
     with pytest.raises(TypeError, match="'mine' must be a function, got 'PlanConditionedActor'"):
         METHODS["mine"] = "PlanConditionedActor"
+
+
+PUBLIC_TABLES = [
+    lw.TASKS, lw.PLAN_FORMATS, SUITES, METHODS, STATES, RELATIONS, lw.data.REWARDS, lw.data.BEHAVIOURS,
+    lw.load_skills(), lw.load_plans("MT10"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("table", PUBLIC_TABLES, ids=lambda table: type(next(iter(table.values()))).__name__)
+@pytest.mark.parametrize("duplicate", [lambda table: pickle.loads(pickle.dumps(table)), copy.copy, copy.deepcopy])
+def test_public_tables_can_be_pickled_and_copied(table, duplicate):
+    other = duplicate(table)
+    assert type(other) is type(table)
+    assert other == table

@@ -250,7 +250,7 @@ def parse_json(content: bytes) -> dict[str, Any]:
         raise ValueError("the JSON is nested too deeply") from None
     if not isinstance(value, dict):
         raise ValueError(f"the JSON must be an object, got {type(value).__name__}")
-    brackets = re.sub(rb'"(?:[^"\\]|\\.)*+"|[^][{}]++', b"", content)
+    brackets = re.sub(rb'"(?:[^"\\]|\\.)*+"|[^][{}"]++', b"", content)
     steps = (1 if bracket in b"[{" else -1 for bracket in brackets)
     if max(accumulate(steps)) > _DEEPEST:  # such objects can be parsed, but not be written or copied
         raise ValueError("the JSON is nested too deeply")

@@ -8,16 +8,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 _MB = 10**6
-_SECONDS, _BYTES_PER_SECOND = 30, _MB  # the limit of time: a constant, and a part for the files' size
+# Each limit is a constant plus a part for the files' size; compressed files are smaller than their content.
+_SECONDS, _BYTES_PER_SECOND = 30, _MB
+_MEMORY, _MEMORY_PER_BYTE = 700 * _MB, 200
 
 
 class LimitError(ValueError):
     """An error for files that a program could not read within its limits."""
-
-
-def allowed_bytes(stored: int) -> int:
-    """Return how many bytes of numbers files of a size may declare: compressed files are smaller than their numbers."""
-    return 100 * _MB + 50 * stored
 
 
 def run_limited(command: Sequence[str | os.PathLike[str]], stored: int) -> subprocess.CompletedProcess[bytes]:
@@ -28,7 +25,7 @@ def run_limited(command: Sequence[str | os.PathLike[str]], stored: int) -> subpr
     Raises:
         LimitError: the command took too long, or was killed, for example because it had no more memory.
     """
-    seconds, memory = _SECONDS + stored / _BYTES_PER_SECOND, 300 * _MB + 4 * allowed_bytes(stored)
+    seconds, memory = _SECONDS + stored / _BYTES_PER_SECOND, _MEMORY + _MEMORY_PER_BYTE * stored
     environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}
     with subprocess.Popen(
         command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE

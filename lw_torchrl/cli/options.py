@@ -277,14 +277,17 @@ def read_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> Plans:
 def find_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> dict[str, ConditionalPlan]:
     """Load plans as :func:`read_plans` does; the result may be empty."""
     if not sources:
-        raise ValueError("--plans requires at least one source: MT10, MT50, a file or a folder")
+        raise ValueError("--plans requires at least one source: MT10, MT50, a suite, a file or a folder")
     suite = _suite_of(tasks)
     plans: dict[str, ConditionalPlan] = {}
     for source in sources:
-        if source not in ("MT10", "MT50"):
-            plans.update(load_plans(source, tasks=tasks))
-        else:
+        if source in ("MT10", "MT50"):
             plans.update(load_plans(source) if suite is None else suite.plans or {})
+        elif source in lw.suites.SUITES and not Path(source).exists():
+            shipped = lw.suites.load_suite(source).plans or {}
+            plans.update({task: plan for task, plan in shipped.items() if task in tasks})
+        else:
+            plans.update(load_plans(source, tasks=tasks))
     for task, plan in plans.items():
         if plan.definition != tasks[task]:
             try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from hashlib import sha256
@@ -319,15 +319,15 @@ class Plans(Mapping[str, ConditionalPlan]):
             raise PlanError(f"{what}. Load or write a plan for each task, or leave the task out.")
 
 
-AnyPlans = Plans | Mapping[str, ConditionalPlan]
-"""The type of a ``plans`` argument: :class:`Plans`, or a mapping from task names to plans."""
+AnyPlans = Plans | Mapping[str, ConditionalPlan] | Sequence[ConditionalPlan]
+"""The type of a ``plans`` argument: :class:`Plans`, a mapping from task names to plans, or a list of plans."""
 
 
 def as_plans(plans: AnyPlans, argument: str = "plans") -> Plans:
-    """Convert a mapping to :class:`Plans`, and return Plans unchanged. Error messages name the ``argument``."""
+    """Convert a mapping or a list of plans to :class:`Plans`; return Plans unchanged. Errors name the ``argument``."""
     if isinstance(plans, Plans):
         return plans
-    if not isinstance(plans, Mapping):
+    if not isinstance(plans, Mapping | list | tuple):
         raise TypeError(f"{argument} must map task names to ConditionalPlan, got {type(plans).__name__}")
     try:
         return Plans(plans)

@@ -148,6 +148,14 @@ class _Bench:
             measured = ", ".join(f"{part * 100:.1f}" for part in moved)
             right = moved.argmax() == axis and abs(moved[axis] - layout.reach) < 0.35 * layout.reach
             wanted = f"{layout.reach * 100:.1f} cm along {name}"
+            if axis == 2 and np.abs(moved).max() < 1e-3 * layout.reach:
+                yield (
+                    f"+{name} moves {_AXES[name]}",
+                    "nothing: the hand stays in a plane",
+                    f"{wanted}, or nothing",
+                    True,
+                )
+                continue
             yield f"+{name} moves {_AXES[name]}", f"({measured}) cm a step", wanted, bool(right)
             for number, slot in enumerate(layout.things, 1):
                 shift = float(np.abs(path[-1][slot.xyz] - path[0][slot.xyz]).max())

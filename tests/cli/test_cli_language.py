@@ -149,6 +149,7 @@ def test_the_last_of_several_plans_for_a_task_is_used(capsys, tmp_path):
     (tmp_path / "push.plan").write_text(str(lw.load_plans("MT10")["push"]).replace("robot.place", "robot.bring"))
     assert "robot.bring" in run(capsys, "tasks", "push", "--plans", "MT10", tmp_path)
     assert "robot.bring" not in run(capsys, "tasks", "push", "--plans", tmp_path, "MT10")
+    assert "robot.bring" not in run(capsys, "tasks", "push", "--plans", tmp_path, "metaworld")
     task = tmp_path / "tasks.toml"
     task.write_text('[reach]\ndescription = "Bring the hand to the ball."\nobjects.ball = "obs[36:39]"\n')
     assert "--plans: the shipped plan does not fit" in fails(capsys, "tasks", "reach", "--task-file", task)

@@ -107,7 +107,7 @@ def test_plans_are_a_sorted_immutable_mapping():
         "push the puck",
     )
     assert as_plans(plans) is plans
-    assert as_plans(dict(plans)) == plans
+    assert as_plans(dict(plans)) == as_plans([*plans.values()]) == plans
     with pytest.raises(TypeError):
         plans["reach"] = plan("reach", ("gripper open", "reach"))
 

@@ -240,3 +240,9 @@ def test_an_invalid_address_in_the_environment_is_named(monkeypatch):
     monkeypatch.setenv("OPENAI_BASE_URL", "localhost:8000")
     with pytest.raises(ValueError, match=r"OPENAI_BASE_URL must be an address .*got 'localhost:8000'"):
         lw.OpenAIPlanner("m")
+
+
+def test_variables_without_effect_on_a_server_of_this_machine_are_named():
+    with serving(FakeServer(failures=[error(503, "busy")] * 9)) as address:
+        last = plans_in(address, SSL_CERT_FILE="/no/such/file.pem")
+    assert "SSL_CERT_FILE, ignored for a server on this machine" in last

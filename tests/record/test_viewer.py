@@ -9,6 +9,7 @@ import sys
 import time
 import urllib.request
 from contextlib import contextmanager
+from http.client import HTTPConnection
 from types import SimpleNamespace
 from urllib.parse import parse_qs, urlsplit
 
@@ -17,6 +18,7 @@ import torch
 from recordings import Recording, listens, skip_without_graphics_driver
 from tensordict import TensorDict
 
+from lw_torchrl._util import limits
 from lw_torchrl.record import RerunLogger, open_viewer, viewer
 from lw_torchrl.record.viewer import find_recordings, rerun_process
 
@@ -70,6 +72,31 @@ def test_missing_or_unreadable_recordings_and_unknown_episodes_are_errors(tmp_pa
             open_viewer(tmp_path / "b.rrd")
 
 
+FORGED = {
+    "cut before the end": lambda content: content[: len(content) // 2] + content[-32:],
+    "cut before a forged end": lambda content: content[: len(content) // 3] + b"RRF2FOOT" + b"x" * 20,
+    "header and end": lambda content: content[:12] + b"RRF2FOOT",
+    "a zeroed page": lambda content: content[:1000] + bytes(2000) + content[3000:],
+    "a size of exabytes": lambda content: content[:-20] + b"\xff" * 7 + content[-13:],
+}
+
+
+@pytest.mark.parametrize("forge", FORGED.values(), ids=FORGED)
+def test_forged_recordings_are_called_damaged(tmp_path, forge):
+    path = write(tmp_path / "a.rrd")
+    path.write_bytes(forge(path.read_bytes()))
+    with pytest.raises(ValueError, match=r"a\.rrd' is not a Rerun recording, or is damaged"):
+        open_viewer(path)
+
+
+def test_a_recording_that_is_never_read_to_its_end_is_damaged(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.rrd")
+    monkeypatch.setattr(limits, "_SECONDS", 1)
+    monkeypatch.setattr(viewer, "_READ", "while True: pass")
+    with pytest.raises(ValueError, match=r"a\.rrd' is damaged .*took more than 1 s"):
+        open_viewer(path)
+
+
 def test_web_viewer_is_served_on_this_machine_until_interrupted(tmp_path):
     path = write(tmp_path / "a.rrd")
     code = f"from lw_torchrl.record import open_viewer; open_viewer({str(path)!r}, episode='Metrics', web_port=0)"
@@ -82,6 +109,14 @@ def test_web_viewer_is_served_on_this_machine_until_interrupted(tmp_path):
         get = urllib.request.build_opener(urllib.request.ProxyHandler({})).open
         with get(f"http://{address.netloc}/", timeout=20) as page:
             assert b"re_viewer" in page.read()
+        for port, path in ((address.port, "/"), (server.port, "/proxy")):
+            statuses = []
+            for host in (f"127.0.0.1:{port}", f"localhost:{port}", f"evil.example:{port}", "127.0.0.1", ""):
+                connection = HTTPConnection("127.0.0.1", port, timeout=20)
+                connection.request("GET", path, headers={"Host": host})
+                statuses.append(connection.getresponse().status)
+                connection.close()
+            assert [status == 403 for status in statuses] == [False, False, True, True, True]
         assert address.hostname == server.hostname == "127.0.0.1"
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0

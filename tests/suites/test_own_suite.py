@@ -383,3 +383,23 @@ def test_suites_and_tables_are_pickled_and_read_only(suite):
         assert pickle.loads(pickle.dumps(table)) == table
         with pytest.raises(TypeError, match="does not support item assignment"):
             table["new"] = table[min(table)]
+
+
+class Planar(ToyEngine):
+    """A hand that stays at one height above the table."""
+
+    def reset(self, rows, seeds):
+        super().reset(rows, seeds)
+        self.state[list(rows), 3] = 0.02
+        return self.state[list(rows)].copy()
+
+    def step(self, action, active):
+        return super().step(action * (np.arange(7) != 3), active)
+
+
+def test_check_accepts_a_suite_in_a_plane():
+    findings = check_suite(make_toy_suite(Planar))
+    assert [finding for finding in findings if not finding.right] == []
+    assert {finding.measured for finding in findings if finding.what == "+z moves up"} == {
+        "nothing: the hand stays in a plane"
+    }

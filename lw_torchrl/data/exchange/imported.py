@@ -19,7 +19,7 @@ from tensordict import TensorDict
 
 from lw_torchrl._util.checks import shown, unknown_name
 from lw_torchrl._util.files import replacing_folder
-from lw_torchrl._util.limits import LimitError, allowed_bytes, run_limited
+from lw_torchrl._util.limits import LimitError, run_limited
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour
@@ -66,7 +66,7 @@ def read_files(source: Path, is_hdf5: bool, layout: Layout) -> ImportedTable:
     order = [name for name in reader.NAMES if name in widths]
     stored = reader.stored_bytes(reader.data_files(source, reader.HDF5 if is_hdf5 else reader.PARQUET))
     with TemporaryDirectory() as folder:
-        argument = json.dumps([is_hdf5, allowed_bytes(stored), {name: widths[name] for name in order}])
+        argument = json.dumps([is_hdf5, {name: widths[name] for name in order}])
         command = [sys.executable, "-P", reader.__file__, str(source.absolute()), folder, argument]
         try:
             done = run_limited(command, stored)

@@ -56,7 +56,6 @@ TASK_NAMES = (
 """The names that files use for an episode's task: attributes, columns, and keys of JSON."""
 _AFTER = ("reward_sparse", "reward_dense", "success", "done", "terminated", "truncated")  # describe the step before
 HDF5, PARQUET = (".hdf5", ".h5", ".hdf"), (".parquet", ".pq")
-_MB = 10**6
 
 
 class Refused(Exception):
@@ -92,7 +91,6 @@ class Files:
 
     Attributes:
         widths: the number of values per row of each column to read.
-        allowed: the number of bytes that may still be read.
         columns, sources: the columns that were read, and the names of these columns in the files.
         unfit: the names of columns whose sizes do not fit.
         lengths, tasks: the number of rows and the possible task names of each episode.
@@ -100,8 +98,8 @@ class Files:
         notes: what the files lack.
     """
 
-    def __init__(self, widths: Mapping[str, int], allowed: int) -> None:
-        self.widths, self.allowed = widths, allowed
+    def __init__(self, widths: Mapping[str, int]) -> None:
+        self.widths = widths
         self.columns: dict[str, Array] = {}
         self.sources: dict[str, str] = {}
         self.unfit: dict[str, str] = {}
@@ -109,22 +107,14 @@ class Files:
         self.tasks: list[list[str]] = []
         self.ends_known, self.notes = True, list[str]()
 
-    def reserve(self, name: str, size: int) -> None:
-        """Raise :class:`Refused` if a column of ``size`` bytes is too large for the files."""
-        self.allowed -= size
-        if self.allowed < 0:
-            raise Refused(f"{name} declares {size / _MB:,.0f} MB or more, which is too much for files of this size")
-
     def choose(self, column: str, fits: Mapping[str, bool]) -> str | None:
         """Return the file's name for a dataset's column: the first name that ``fits``, or None."""
         present = [name for name in NAMES[column] if name in fits]
-        for name in present:
-            if fits[name]:
-                self.sources[column] = name
-                return name
-        if present:
+        if fitting := [name for name in present if fits[name]]:
+            self.sources[column] = fitting[0]
+        elif present:
             self.unfit[column] = present[0]
-        return None
+        return self.sources.get(column)
 
     def require(self, column: str, seen: Mapping[str, float]) -> None:
         """Raise :class:`Refused` unless a name was chosen for a column; ``seen`` are the columns' values per row."""
@@ -144,11 +134,6 @@ class Files:
 
 
 # ---- parquet
-
-
-def _leaf(path: str) -> str:
-    """Return the name of a leaf column without the levels of lists: "action.list.element" is "action"."""
-    return re.sub(r"(\.(list|bag|array|array_element|element|item))+$", "", path)
 
 
 def read_parquet(source: Path, files: Files) -> None:
@@ -178,8 +163,6 @@ def read_parquet(source: Path, files: Files) -> None:
     files.require("observation", seen)
     index = [name for name in ("episode_index", "frame_index", "task_index") if values.get(name) == rows]
     texts = [name for name in TASK_NAMES if values.get(name) == rows and name not in index]
-    for name in (*chosen, *index, *texts):
-        files.reserve(name, 8 * values[name])
     parts: dict[str, list[Array]] = {name: [] for name in (*chosen, *index, *texts)}
     words: dict[str, list[str]] = {name: [] for name in texts}
     for path, (_, columns) in zip(paths, leaves, strict=True):
@@ -203,19 +186,16 @@ def read_parquet(source: Path, files: Files) -> None:
 
 def _leaves(metadata: Any) -> tuple[int, dict[str, tuple[str, int, bool]]]:
     """Return the number of rows of a parquet file, and by name the path of each leaf column, its number of values, and
-    whether the values are numbers."""
+    whether the values are numbers. Names lack the levels of lists: "action.list.element" is "action"."""
     leaves: dict[str, tuple[str, int, bool]] = {}
     for place in range(metadata.num_columns):
-        groups = [metadata.row_group(group).column(place) for group in range(metadata.num_row_groups)]
+        number = sum(metadata.row_group(group).column(place).num_values for group in range(metadata.num_row_groups))
         column = metadata.schema.column(place)
-        path = column.path
-        leaves.setdefault(_leaf(path), (path, sum(group.num_values for group in groups), _is_number(column)))
+        name = re.sub(r"(\.(list|bag|array|array_element|element|item))+$", "", column.path)
+        kind = column.logical_type.type
+        is_number = kind == "FLOAT16" or (kind in ("NONE", "INT") and "BYTE" not in column.physical_type)
+        leaves.setdefault(name, (column.path, number, is_number))
     return metadata.num_rows, leaves
-
-
-def _is_number(column: Any) -> bool:
-    kind = column.logical_type.type
-    return kind == "FLOAT16" or (kind in ("NONE", "INT") and "BYTE" not in column.physical_type)
 
 
 def _numbers(name: str, column: Any) -> Array:
@@ -244,11 +224,9 @@ def _codes(column: Any, words: list[str]) -> Array:
     if pa.types.is_nested(column.type):
         return np.full(len(column), -1)
     encoded = column.cast(pa.string()).dictionary_encode()
-    places = []
-    for text in encoded.dictionary.to_pylist():
-        if text not in words:
-            words.append(text)
-        places.append(words.index(text))
+    texts = encoded.dictionary.to_pylist()
+    words += [text for text in texts if text not in words]
+    places = [words.index(text) for text in texts]
     codes = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
     return np.asarray([*places, -1])[codes]
 
@@ -256,10 +234,8 @@ def _codes(column: Any, words: list[str]) -> Array:
 def _whole(name: str, column: Array) -> Array:
     """Return a column of indices as integers; raise :class:`Refused` for other numbers, such as NaN."""
     column = column.reshape(len(column))
-    if column.dtype.kind == "f":
-        odd = column[~(np.isfinite(column) & (column == np.round(column)))]
-        if odd.size:
-            raise Refused(f"{name} must hold whole numbers, but holds {odd[0]}")
+    if column.dtype.kind == "f" and (odd := column[~(np.isfinite(column) & (column == np.round(column)))]).size:
+        raise Refused(f"{name} must hold whole numbers, but holds {odd[0]}")
     return column.astype(np.int64)
 
 
@@ -278,7 +254,7 @@ def _arrange(
     rows = sum(of_file)
     numbers = {name: _whole(name, column) for name, column in index.items()}
     file = np.repeat(np.arange(len(of_file)), of_file)
-    listed = _episodes(source / "meta", files)
+    listed = _episodes(source / "meta")
     frame = numbers.get("frame_index", np.zeros(rows, np.int64))
     files.ends_known = True
     if "episode_index" in numbers:
@@ -327,7 +303,7 @@ def _same(column: Array) -> Array:
     return np.asarray(column[1:] == column[:-1])
 
 
-def _records(path: Path, names: Sequence[str], files: Files | None = None) -> list[dict[str, Any]]:
+def _records(path: Path, names: Sequence[str]) -> list[dict[str, Any]]:
     """Read the lines of a JSON lines file, or the rows of a parquet file, as dictionaries."""
     import pyarrow.parquet as pq
 
@@ -336,16 +312,14 @@ def _records(path: Path, names: Sequence[str], files: Files | None = None) -> li
         return [record for record in records if isinstance(record, dict)]
     with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
         leaves = {name: leaf for name, leaf in _leaves(file.metadata)[1].items() if name in names}
-        if files is not None:
-            files.reserve(path.name, 8 * sum(number for _, number, _ in leaves.values()))
         rows: list[dict[str, Any]] = file.read(columns=[leaf for leaf, _, _ in leaves.values()]).to_pylist()
         return rows
 
 
-def _episodes(meta: Path, files: Files) -> dict[int, dict[str, Any]]:
+def _episodes(meta: Path) -> dict[int, dict[str, Any]]:
     """Read LeRobot's list of episodes: length and tasks of each episode_index."""
     paths = [meta / "episodes.jsonl"] if (meta / "episodes.jsonl").is_file() else data_files(meta / "episodes", PARQUET)
-    records = [record for path in paths for record in _records(path, ("episode_index", "length", "tasks"), files)]
+    records = [record for path in paths for record in _records(path, ("episode_index", "length", "tasks"))]
     return {record["episode_index"]: record for record in records if isinstance(record.get("episode_index"), int)}
 
 
@@ -372,15 +346,12 @@ def read_hdf5(source: Path, files: Files) -> None:
 
     paths = data_files(source, HDF5)
     shapes: list[dict[str, tuple[int, ...]]] = []
-    dtypes: list[dict[str, Any]] = []
     for path in paths:
         path.open("rb").close()  # HDF5's own errors do not tell limits of the system from damage
         with h5py.File(path, "r") as file:
             for group, known in _groups(file):
                 files.ends_known &= known
-                items = dict(_items(group))
-                shapes.append({name: item.shape for name, item in items.items()})
-                dtypes.append({name: item.dtype for name, item in items.items()})
+                shapes.append({name: item.shape for name, item in _items(group)})
     if not shapes:
         raise Refused("the files hold no group with actions, such as data/demo_0, and no actions at the root")
     seen = {name: float(np.prod(shape[1:])) for name, shape in shapes[0].items()}
@@ -397,18 +368,15 @@ def read_hdf5(source: Path, files: Files) -> None:
             files.require("action", seen)
             steps = [shape[name][0] for shape in shapes if name]
     files.require("observation", seen)
-    for name in files.sources.values():
-        sizes = (np.prod(s[name], dtype=float) * d[name].itemsize for s, d in zip(shapes, dtypes, strict=True))
-        files.reserve(name, int(sum(sizes)))
     parts: list[dict[str, Array]] = []
     for path in paths:
         with h5py.File(path, "r") as file:
-            about = [*_texts_of_json(_companion(path))]
+            about = [*_texts(_companion(path))]
             for group, known in _groups(file):
                 items = dict(_items(group))
                 parts.append(_steps({column: items[name][()] for column, name in files.sources.items()}))
                 above = (group, group.parent, file) if known else (group, file)
-                texts = [text for each in above for text in _texts_of_attributes(each)]
+                texts = [text for each in above for text in _texts({**each.attrs})]
                 files.tasks.append(list(dict.fromkeys([*_texts_of_items(group), *texts, *about])))
     files.lengths = [len(part["action"]) for part in parts]
     columns = set.intersection(*({*part} for part in parts))
@@ -482,26 +450,18 @@ def _companion(path: Path) -> Any:
     return None
 
 
-def _texts_of_json(value: Any) -> Iterator[str]:
-    """Yield the values of a JSON object's keys in TASK_NAMES, also those of nested objects and of JSON in strings."""
-    if isinstance(value, str) and value.lstrip().startswith("{"):
-        with suppress(ValueError, RecursionError):
-            yield from _texts_of_json(json.loads(value))
-    if isinstance(value, dict):
+def _texts(value: Any) -> Iterator[str]:
+    """Yield the values of the keys in TASK_NAMES, in a mapping, in nested mappings and in texts that hold JSON."""
+    if isinstance(value, Mapping):
         for name in TASK_NAMES:
             yield from _plain_texts(value.get(name))
         for inner in value.values():
-            if isinstance(inner, (str, dict)):
-                yield from _texts_of_json(inner)
-
-
-def _texts_of_attributes(group: Any) -> Iterator[str]:
-    values = {name: group.attrs[name] for name in group.attrs}
-    for name in TASK_NAMES:
-        yield from _plain_texts(values.get(name))
-    for value in values.values():
-        for text in _plain_texts(value):
-            yield from _texts_of_json(text)
+            yield from _texts(inner)
+        return
+    for text in _plain_texts(value):
+        if text.startswith("{"):
+            with suppress(ValueError, RecursionError):
+                yield from _texts(json.loads(text))
 
 
 def _texts_of_items(group: Any) -> Iterator[str]:
@@ -540,10 +500,10 @@ def _report(out: Path, **values: Any) -> None:
     (out / "table.json").write_text(json.dumps(values), encoding="utf-8")
 
 
-def main(source: Path, out: Path, is_hdf5: bool, allowed: int, widths: Mapping[str, int]) -> None:
+def main(source: Path, out: Path, is_hdf5: bool, widths: Mapping[str, int]) -> None:
     """Read files, and write the columns or the error to the folder ``out``."""
     try:
-        files = Files(widths, allowed)
+        files = Files(widths)
         (read_hdf5 if is_hdf5 else read_parquet)(source, files)
         files.save(out)
     except Refused as error:
@@ -551,7 +511,7 @@ def main(source: Path, out: Path, is_hdf5: bool, allowed: int, widths: Mapping[s
     except ImportError as error:
         _report(out, missing=error.name)
     except MemoryError:
-        _report(out, refused="the files declare more memory than is available for files of this size")
+        _report(out, refused="the files declare more numbers than files of this size may hold")
     except OSError as error:
         if error.errno is None:
             _report(out, corrupted=f"{type(error).__name__}: {error}")
