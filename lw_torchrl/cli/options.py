@@ -284,7 +284,7 @@ def find_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> dict[str, C
         if source in ("MT10", "MT50"):
             plans.update(load_plans(source) if suite is None else suite.plans or {})
         elif source in lw.suites.SUITES and not Path(source).exists():
-            shipped = lw.suites.load_suite(source).plans or {}
+            shipped: Mapping[str, ConditionalPlan] = lw.suites.load_suite(source).plans or {}
             plans.update({task: plan for task, plan in shipped.items() if task in tasks})
         else:
             plans.update(load_plans(source, tasks=tasks))

@@ -3,6 +3,7 @@
 import gzip
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -245,4 +246,4 @@ def test_an_invalid_address_in_the_environment_is_named(monkeypatch):
 def test_variables_without_effect_on_a_server_of_this_machine_are_named():
     with serving(FakeServer(failures=[error(503, "busy")] * 9)) as address:
         last = plans_in(address, SSL_CERT_FILE="/no/such/file.pem")
-    assert "SSL_CERT_FILE, ignored for a server on this machine" in last
+    assert re.search("SSL_CERT_FILE[A-Z_, ]*, ignored for a server on this machine", last)

@@ -141,7 +141,7 @@ def read_parquet(source: Path, files: Files) -> None:
     import pyarrow.parquet as pq
 
     meta = source / "meta"
-    info = _json_file(meta / "info.json") if (meta / "info.json").is_file() else {}
+    info = json.loads((meta / "info.json").read_text("utf-8-sig")) if (meta / "info.json").is_file() else {}
     version = str(info.get("codebase_version", "v3.0"))
     if not version.startswith(("v2.", "v3.")):
         raise Refused(f"LeRobot format version {version[:20]!r} is not supported; use v2.0 to v3.0")
@@ -162,9 +162,8 @@ def read_parquet(source: Path, files: Files) -> None:
     files.require("action", seen)
     files.require("observation", seen)
     index = [name for name in ("episode_index", "frame_index", "task_index") if values.get(name) == rows]
-    texts = [name for name in TASK_NAMES if values.get(name) == rows and name not in index]
+    texts = [name for name in TASK_NAMES if values.get(name) == rows and leaves[0][1][name][0] == name not in index]
     parts: dict[str, list[Array]] = {name: [] for name in (*chosen, *index, *texts)}
-    words: dict[str, list[str]] = {name: [] for name in texts}
     for path, (_, columns) in zip(paths, leaves, strict=True):
         with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
             table = file.read(columns=[columns[name][0] for name in parts], use_threads=False)
@@ -174,14 +173,20 @@ def read_parquet(source: Path, files: Files) -> None:
         for name in [*parts]:
             column = read[name].combine_chunks()
             try:
-                parts[name].append(_codes(column, words[name]) if name in words else _numbers(name, column))
+                parts[name].append(_strings(column) if name in texts else _numbers(name, column))
             except Refused:
                 if chosen.get(name, "action") in ("action", "observation"):
                     raise
                 files.unfit[chosen.pop(name)] = name  # a column that can be missing
                 del parts[name]
     read = {name: np.concatenate(arrays) for name, arrays in parts.items()}
-    _arrange(source, info, files, {name: read.pop(name) for name in index}, read, words, chosen, paths, of_file)
+    read |= {name: _whole(name, read[name]) for name in index}
+    file_numbers = np.repeat(np.arange(len(of_file)), of_file)
+    is_episode = all(re.match(r"episode\D*\d+$", path.stem, re.IGNORECASE) for path in paths)
+    order = _find_episodes(meta, files, read, [name for name in texts if name in read], file_numbers, is_episode)
+    files.columns = {column: read[name][order] for name, column in chosen.items()}
+    if (frames := info.get("total_frames", rows)) != rows:
+        files.notes.append(f"time steps: meta/info.json lists {frames}, but the data files hold {rows}")
 
 
 def _leaves(metadata: Any) -> tuple[int, dict[str, tuple[str, int, bool]]]:
@@ -217,18 +222,11 @@ def _numbers(name: str, column: Any) -> Array:
     return values if len(values) == rows else values.reshape(rows, -1)
 
 
-def _codes(column: Any, words: list[str]) -> Array:
-    """Convert an Arrow column of texts to indices in ``words``, to which new texts are added; -1 for absent texts."""
+def _strings(column: Any) -> Array:
+    """Convert an Arrow column to strings (R,); None for absent ones."""
     import pyarrow as pa
 
-    if pa.types.is_nested(column.type):
-        return np.full(len(column), -1)
-    encoded = column.cast(pa.string()).dictionary_encode()
-    texts = encoded.dictionary.to_pylist()
-    words += [text for text in texts if text not in words]
-    places = [words.index(text) for text in texts]
-    codes = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
-    return np.asarray([*places, -1])[codes]
+    return np.array(column.cast(pa.string()).to_pylist(), dtype=object)
 
 
 def _whole(name: str, column: Array) -> Array:
@@ -239,63 +237,49 @@ def _whole(name: str, column: Array) -> Array:
     return column.astype(np.int64)
 
 
-def _arrange(
-    source: Path,
-    info: Mapping[str, Any],
-    files: Files,
-    index: Mapping[str, Array],
-    read: Mapping[str, Array],
-    words: Mapping[str, list[str]],
-    chosen: Mapping[str, str],
-    paths: Sequence[Path],
-    of_file: Sequence[int],
-) -> None:
-    """Sort the rows of parquet files by episode and time, and find each episode's length and task."""
-    rows = sum(of_file)
-    numbers = {name: _whole(name, column) for name, column in index.items()}
-    file = np.repeat(np.arange(len(of_file)), of_file)
-    listed = _episodes(source / "meta")
-    frame = numbers.get("frame_index", np.zeros(rows, np.int64))
-    files.ends_known = True
-    if "episode_index" in numbers:
-        episode = numbers["episode_index"]
-    elif all(re.match(r"episode\D*\d+$", path.stem, re.IGNORECASE) for path in paths):
+def _find_episodes(
+    meta: Path, files: Files, read: Mapping[str, Array], texts: Sequence[str], file: Array, is_episode: bool
+) -> Array:
+    """Find the length and the tasks of each episode, and return the order (R,) of the rows by episode and time.
+
+    ``file`` (R,) is the number of each row's file, and ``is_episode`` whether each file's name is that of an episode.
+    """
+    rows, listed, names = len(file), _listed(meta, "episodes"), _listed(meta, "tasks")
+    frame = read.get("frame_index", np.zeros(rows, np.int64))
+    if "episode_index" in read:
+        episode = read["episode_index"]
+    elif is_episode:
         episode = file
     elif sum(lengths := [each.get("length", 0) for _, each in sorted(listed.items())]) == rows:
         episode = np.repeat(sorted(listed), lengths)
     else:  # where the task changes, a new episode must begin
         files.ends_known = False
-        marks = [numbers["task_index"]] if "task_index" in numbers else [read[name] for name in words]
-        changes = np.any([np.diff(mark, prepend=mark[:1]) != 0 for mark in marks] or [np.zeros(rows, bool)], axis=0)
-        episode, frame = np.cumsum(changes), np.arange(rows)
+        marks = [read["task_index"]] if "task_index" in read else [read[name] for name in texts]
+        changes = [np.concatenate([[False], ~_same(mark)]) for mark in marks]
+        episode, frame = np.cumsum(np.any(changes or [np.zeros(rows, bool)], axis=0)), np.arange(rows)
     order = np.lexsort((frame, episode))
-    if "frame_index" in numbers and (_same(episode[order]) & _same(frame[order])).any():
+    same = _same(episode[order])
+    if "frame_index" in read and (same & _same(frame[order])).any():
         order = np.lexsort((frame, episode, file))  # each file numbers its episodes on its own
-        if (_same(episode[order]) & _same(frame[order]) & _same(file[order])).any():
+        same = _same(episode[order]) & _same(file[order])
+        if (same & _same(frame[order])).any():
             raise Refused("frame_index must differ between the rows of an episode")
-        new = ~(_same(episode[order]) & _same(file[order]))
-    else:
-        new = ~_same(episode[order])
-    starts = np.flatnonzero(np.concatenate([[True], new]))
+    starts = np.flatnonzero(np.concatenate([[True], ~same]))
     files.lengths = np.diff(starts, append=rows).tolist()
-    files.columns = {column: read[name][order] for name, column in chosen.items()}
-    texts = _task_texts(source / "meta")
     for start, length in zip(starts.tolist(), files.lengths, strict=True):
         of_episode = order[start : start + length]
         number = int(episode[of_episode[0]])
-        about = listed.get(number, {}) if "episode_index" in numbers else {}
+        about = listed.get(number, {}) if "episode_index" in read else {}
         if about.get("length", length) != length:
             raise Refused(f"episode {number} has {length} rows, but the metadata lists {about['length']}")
-        names = [str(text) for text in about.get("tasks") or ()]
-        for name in words:
-            codes = np.unique(read[name][of_episode])
-            names += [words[name][code] for code in codes if code >= 0 and len(codes) == 1]
-        if "task_index" in numbers:
-            tasks = np.unique(numbers["task_index"][of_episode]).tolist()
-            names += [*texts.get(tasks[0], ()), str(tasks[0])] if len(tasks) == 1 else []
-        files.tasks.append(list(dict.fromkeys(names)))
-    if (frames := info.get("total_frames", rows)) != rows:
-        files.notes.append(f"time steps: meta/info.json lists {frames}, but the data files hold {rows}")
+        tasks = [*(about.get("tasks") or ())]
+        for name in texts:
+            tasks += values if len(values := {*read[name][of_episode]}) == 1 else ()
+        if "task_index" in read and len(values := {*read["task_index"][of_episode].tolist()}) == 1:
+            about = names.get(next(iter(values)), {})
+            tasks += [about.get(name) for name in ("name", "task", "__index_level_0__")] + [*values]
+        files.tasks.append([*dict.fromkeys(str(task) for task in tasks if task is not None)])
+    return order
 
 
 def _same(column: Array) -> Array:
@@ -303,38 +287,22 @@ def _same(column: Array) -> Array:
     return np.asarray(column[1:] == column[:-1])
 
 
-def _records(path: Path, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Read the lines of a JSON lines file, or the rows of a parquet file, as dictionaries."""
+def _listed(meta: Path, kind: str) -> dict[int, dict[str, Any]]:
+    """Read LeRobot's list of "episodes" or "tasks" by their number, from JSON lines or parquet files."""
     import pyarrow.parquet as pq
 
-    if path.suffix == ".jsonl":
-        records = [json.loads(line) for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
-        return [record for record in records if isinstance(record, dict)]
-    with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
-        leaves = {name: leaf for name, leaf in _leaves(file.metadata)[1].items() if name in names}
-        rows: list[dict[str, Any]] = file.read(columns=[leaf for leaf, _, _ in leaves.values()]).to_pylist()
-        return rows
-
-
-def _episodes(meta: Path) -> dict[int, dict[str, Any]]:
-    """Read LeRobot's list of episodes: length and tasks of each episode_index."""
-    paths = [meta / "episodes.jsonl"] if (meta / "episodes.jsonl").is_file() else data_files(meta / "episodes", PARQUET)
-    records = [record for path in paths for record in _records(path, ("episode_index", "length", "tasks"))]
-    return {record["episode_index"]: record for record in records if isinstance(record.get("episode_index"), int)}
-
-
-def _task_texts(meta: Path) -> dict[int, list[str]]:
-    """Read LeRobot's list of tasks: the name or description of each task_index."""
-    names = ("name", "task", "__index_level_0__")
-    for path in (meta / "tasks.jsonl", meta / "tasks.parquet"):
-        if path.is_file():
-            records = _records(path, ("task_index", *names))
-            return {
-                record["task_index"]: [str(record[name]) for name in names if name in record]
-                for record in records
-                if isinstance(record.get("task_index"), int)
-            }
-    return {}
+    names = ("episode_index", "length", "tasks", "task_index", "name", "task", "__index_level_0__")
+    records: list[Any] = []
+    if (lines := meta / f"{kind}.jsonl").is_file():
+        records = [json.loads(line) for line in lines.read_text("utf-8-sig").splitlines() if line.strip()]
+    elif meta.is_dir():
+        single = meta / f"{kind}.parquet"
+        for path in [single] if single.is_file() else data_files(meta / kind, PARQUET):
+            with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
+                leaves = [leaf for name, (leaf, _, _) in _leaves(file.metadata)[1].items() if name in names]
+                records += file.read(columns=leaves).to_pylist()
+    key = f"{kind[:-1]}_index"
+    return {row[key]: row for row in records if isinstance(row, dict) and isinstance(row.get(key), int)}
 
 
 # ---- HDF5
@@ -484,16 +452,6 @@ def _plain_texts(value: Any) -> Iterator[str]:
 
 
 # ---- the child process
-
-
-def _json_file(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(path.read_text("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise Refused(f"{path.name} cannot be read: {error}") from error
-    if not isinstance(value, dict):
-        raise Refused(f"{path.name} must hold a JSON object, got {type(value).__name__}")
-    return value
 
 
 def _report(out: Path, **values: Any) -> None:
