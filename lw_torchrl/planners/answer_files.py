@@ -15,7 +15,7 @@ from lw_torchrl._util.checks import Count, check_choice, check_value, counted, d
 from lw_torchrl._util.files import AnyPath, expanded, read_json, read_text, write_json, write_text
 from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
 from lw_torchrl.language.nearest import StepMapper
-from lw_torchrl.language.plan_decoding import DecodedPlan, decode_as, decode_plan
+from lw_torchrl.language.plan_decoding import DecodedPlan, decode_as, decode_plan, without_thoughts
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import Task, TaskList, named_tasks
 from lw_torchrl.planners.prompts import passes, read_structured
@@ -65,8 +65,8 @@ class Reply:
 
     @property
     def is_answer(self) -> bool:
-        """Whether the model answered, if only by a refusal. Other replies are not cached."""
-        return bool(self.text.strip() or self.refusal.strip())
+        """Whether the model answered, if only by a refusal. Other replies, such as mere thoughts, are not cached."""
+        return bool(re.search(r"\w", without_thoughts(self.text, [])) or self.refusal.strip())
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def read_reply(
     notes = [_CUT_OFF[reply.finish]] if reply.finish in _CUT_OFF else []
     if reply.refusal:
         notes.append(f"the model refused: {shown(reply.refusal)}")
-    elif not raw.strip():
+    elif not reply.is_answer:
         notes.append("the answer is empty")
     elif schema and reply.finish != "length":
         valid = False

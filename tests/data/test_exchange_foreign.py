@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -283,6 +285,32 @@ def test_ends_of_episodes_are_derived_for_flat_hdf5(tmp_path, marks, options, le
     if options:
         with pytest.raises(ValueError, match="episode_length must divide"):
             lw.import_dataset(tmp_path / "a.H5", tmp_path / "none", task="push", episode_length=4)
+
+
+def test_frames_that_start_again_end_an_episode(tmp_path):
+    frames = [3, 4, 5, 3, 4, 3, 4, 5, 6]
+    rows = {"observation": STATES.tolist(), "action": ACTIONS.tolist(), "frame_index": frames, "task": ["push"] * 9}
+    pq.write_table(pa.table(rows), tmp_path / "a.parquet")
+    made = imported(tmp_path / "a.parquet", tmp_path / "out", "lacks", episodes_per_task=3)
+    assert [info.length for info in made.episodes] == [3, 2, 4]
+
+
+@pytest.mark.parametrize("kind", ["parquet", "hdf5"])
+def test_a_limit_of_file_sizes_is_named(tmp_path, kind):
+    if kind == "parquet":
+        flat(tmp_path / "a.parquet")
+    else:
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(tmp_path / "a.hdf5", "w") as file:
+            file["data/demo_0/actions"], file["data/demo_0/obs"] = ACTIONS, STATES
+    code = (
+        "import resource, sys, lw_torchrl as lw; resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300));"
+        "lw.import_dataset(sys.argv[1], sys.argv[2], task='push')"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / f"a.{kind}"), str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert "OSError: [Errno 27] File too large" in done.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_maniskill_files_are_imported(tmp_path):

@@ -220,9 +220,12 @@ def test_a_printed_address_has_no_secrets():
         (completion(None, reasoning_content="hm"), "the server sent reasoning_content instead of an answer"),
         ({**completion("no"), "usage": None}, None),
         ({**completion("no"), "usage": {"prompt_tokens": "x"}, "model": 3}, None),
-        (completion("\ud800\ufeff\r"), None),
+        (completion("\ud800\ufeff\r"), "the answer is empty"),
+        (completion("\u200b\u2060"), "the answer is empty"),
+        (completion("<think>The gripper is above the puck.</think>\n"), "the answer is empty"),
+        (completion("<think>First, I", "length"), "the answer is empty"),
     ],
-    ids=range(9),
+    ids=range(12),
 )  # fmt: skip
 def test_answers_without_a_plan(ask, tmp_path, body, note):
     (answer,) = ask(FakeServer(lambda _: body), "push", out=tmp_path / "out")
@@ -230,7 +233,7 @@ def test_answers_without_a_plan(ask, tmp_path, body, note):
     assert answer.decoded.reason
     assert note is None or any(note in other for other in answer.notes)
     (again,) = ask(FakeServer(), "push")
-    if answer.text or any("refused" in note for note in answer.notes):
+    if (answer.text and "the answer is empty" not in answer.notes) or any("refused" in note for note in answer.notes):
         assert (again.cached, again.text, again.notes) == (True, answer.text, answer.notes)
     else:  # an empty reply is not an answer, so the model is asked again
         assert again.decoded.plan == PLANS["push"]

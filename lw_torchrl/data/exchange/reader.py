@@ -128,7 +128,10 @@ class Files:
     def save(self, out: Path) -> None:
         """Write the columns and the description."""
         for name, column in self.columns.items():
-            np.save(out / f"{name}.npy", column, allow_pickle=False)
+            with (out / f"{name}.npy").open("wb") as file:  # np.save raises errors that do not name limits
+                column = np.ascontiguousarray(column)
+                np.lib.format.write_array_header_2_0(file, np.lib.format.header_data_from_array_1_0(column))
+                file.write(memoryview(column).cast("B"))
         names = ("lengths", "tasks", "sources", "unfit", "ends_known", "notes")
         _report(out, columns=[*self.columns], **{name: getattr(self, name) for name in names})
 
@@ -252,10 +255,12 @@ def _find_episodes(
         episode = file
     elif sum(lengths := [each.get("length", 0) for _, each in sorted(listed.items())]) == rows:
         episode = np.repeat(sorted(listed), lengths)
-    else:  # where the task changes, a new episode must begin
-        files.ends_known = False
+    else:  # where the task changes or the frames start again, a new episode must begin
+        restarts = frame == frame.min()
+        files.ends_known = "frame_index" in read and bool(restarts.sum() > 1)
         marks = [read["task_index"]] if "task_index" in read else [read[name] for name in texts]
         changes = [np.concatenate([[False], ~_same(mark)]) for mark in marks]
+        changes += [restarts] * files.ends_known
         episode, frame = np.cumsum(np.any(changes or [np.zeros(rows, bool)], axis=0)), np.arange(rows)
     order = np.lexsort((frame, episode))
     same = _same(episode[order])
