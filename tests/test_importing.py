@@ -139,6 +139,6 @@ def test_names_and_rooms_are_attributes():
 
 
 def test_an_unknown_name_lists_names_with_the_same_verb():
-    with pytest.raises(AttributeError, match="'load_policy'.*load_actor"):
+    with pytest.raises(AttributeError, match=r"'load_policy'.*load_actor"):
         _ = lw_torchrl.load_policy
     assert not hasattr(lw_torchrl, "frobnicate")
