@@ -97,6 +97,7 @@ def test_a_recording_that_is_never_read_to_its_end_is_damaged(tmp_path, monkeypa
         open_viewer(path)
 
 
+@pytest.mark.slow
 def test_web_viewer_is_served_on_this_machine_until_interrupted(tmp_path):
     path = write(tmp_path / "a.rrd")
     code = f"from lw_torchrl.record import open_viewer; open_viewer({str(path)!r}, episode='Metrics', web_port=0)"
