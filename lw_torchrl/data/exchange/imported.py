@@ -66,7 +66,8 @@ def read_files(source: Path, is_hdf5: bool, layout: Layout) -> ImportedTable:
     order = [name for name in reader.NAMES if name in widths]
     stored = reader.stored_bytes(reader.data_files(source, reader.HDF5 if is_hdf5 else reader.PARQUET))
     with TemporaryDirectory() as folder:
-        argument = json.dumps([is_hdf5, {name: widths[name] for name in order}])
+        allowed = 100 * 10**6 + 50 * stored  # bytes of numbers; compressed files are smaller than their numbers
+        argument = json.dumps([is_hdf5, allowed, {name: widths[name] for name in order}])
         command = [sys.executable, "-P", reader.__file__, str(source.absolute()), folder, argument]
         try:
             done = run_limited(command, stored)

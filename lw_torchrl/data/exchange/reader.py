@@ -91,6 +91,7 @@ class Files:
 
     Attributes:
         widths: the number of values per row of each column to read.
+        allowed: the number of bytes that may still be read.
         columns, sources: the columns that were read, and the names of these columns in the files.
         unfit: the names of columns whose sizes do not fit.
         lengths, tasks: the number of rows and the possible task names of each episode.
@@ -98,14 +99,20 @@ class Files:
         notes: what the files lack.
     """
 
-    def __init__(self, widths: Mapping[str, int]) -> None:
-        self.widths = widths
+    def __init__(self, widths: Mapping[str, int], allowed: int) -> None:
+        self.widths, self.allowed = widths, allowed
         self.columns: dict[str, Array] = {}
         self.sources: dict[str, str] = {}
         self.unfit: dict[str, str] = {}
         self.lengths: list[int] = []
         self.tasks: list[list[str]] = []
         self.ends_known, self.notes = True, list[str]()
+
+    def reserve(self, name: str, size: float) -> None:
+        """Raise :class:`Refused` if a column of ``size`` bytes is too large for the files."""
+        self.allowed -= int(size)
+        if self.allowed < 0:
+            raise Refused(f"{name} declares {size / 1e6:,.0f} MB or more, which is too much for files of this size")
 
     def choose(self, column: str, fits: Mapping[str, bool]) -> str | None:
         """Return the file's name for a dataset's column: the first name that ``fits``, or None."""
@@ -167,6 +174,8 @@ def read_parquet(source: Path, files: Files) -> None:
     index = [name for name in ("episode_index", "frame_index", "task_index") if values.get(name) == rows]
     texts = [name for name in TASK_NAMES if values.get(name) == rows and leaves[0][1][name][0] == name not in index]
     parts: dict[str, list[Array]] = {name: [] for name in (*chosen, *index, *texts)}
+    for name in parts:
+        files.reserve(name, 8 * values[name])
     for path, (_, columns) in zip(paths, leaves, strict=True):
         with pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True) as file:
             table = file.read(columns=[columns[name][0] for name in parts], use_threads=False)
@@ -341,6 +350,8 @@ def read_hdf5(source: Path, files: Files) -> None:
             files.require("action", seen)
             steps = [shape[name][0] for shape in shapes if name]
     files.require("observation", seen)
+    for name in files.sources.values():
+        files.reserve(name, sum(8 * np.prod(shape[name], dtype=float) for shape in shapes))
     parts: list[dict[str, Array]] = []
     for path in paths:
         with h5py.File(path, "r") as file:
@@ -463,10 +474,10 @@ def _report(out: Path, **values: Any) -> None:
     (out / "table.json").write_text(json.dumps(values), encoding="utf-8")
 
 
-def main(source: Path, out: Path, is_hdf5: bool, widths: Mapping[str, int]) -> None:
+def main(source: Path, out: Path, is_hdf5: bool, allowed: int, widths: Mapping[str, int]) -> None:
     """Read files, and write the columns or the error to the folder ``out``."""
     try:
-        files = Files(widths)
+        files = Files(widths, allowed)
         (read_hdf5 if is_hdf5 else read_parquet)(source, files)
         files.save(out)
     except Refused as error:
