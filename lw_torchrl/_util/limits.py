@@ -10,6 +10,7 @@ from contextlib import suppress
 _MB = 10**6
 # Each limit is a constant plus a part for the files' size; compressed files are smaller than their content.
 _SECONDS, _BYTES_PER_SECOND = 30, _MB
+_PATIENCE = 4  # a busy or waiting process may take longer than its processor time, by this factor
 _MEMORY, _MEMORY_PER_BYTE = 700 * _MB, 200
 
 
@@ -25,21 +26,23 @@ def run_limited(command: Sequence[str | os.PathLike[str]], stored: int) -> subpr
     Raises:
         LimitError: the command took too long, or was killed, for example because it had no more memory.
     """
-    seconds, memory = _SECONDS + stored / _BYTES_PER_SECOND, _MEMORY + _MEMORY_PER_BYTE * stored
+    seconds, memory = _SECONDS + stored // _BYTES_PER_SECOND, _MEMORY + _MEMORY_PER_BYTE * stored
     environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}
     with subprocess.Popen(
         command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
         try:
-            with suppress(ImportError, AttributeError, OSError):  # other systems than Linux have no limits of memory
+            with suppress(ImportError, AttributeError, OSError):  # other systems than Linux only have the last limit
                 import resource
 
                 resource.prlimit(process.pid, resource.RLIMIT_DATA, (memory, memory))
-            output, errors = process.communicate(timeout=seconds)
+                resource.prlimit(process.pid, resource.RLIMIT_CPU, (seconds, seconds))
+            output, errors = process.communicate(timeout=_PATIENCE * seconds)
         except subprocess.TimeoutExpired:
-            raise LimitError(f"reading {stored:,} bytes took more than {seconds:.0f} s, so it was stopped") from None
+            output = errors = b""
         finally:
             process.kill()
     if process.returncode < 0:
-        raise LimitError(f"reading {stored:,} bytes failed within {memory / _MB:,.0f} MB of memory")
+        limits = f"{seconds} s and {memory / _MB:,.0f} MB of memory"
+        raise LimitError(f"reading {stored:,} bytes exceeded the limits of {limits}, so it was stopped")
     return subprocess.CompletedProcess(process.args, process.returncode, output, errors)

@@ -138,7 +138,7 @@ class Files:
             with (out / f"{name}.npy").open("wb") as file:  # np.save raises errors that do not name limits
                 column = np.ascontiguousarray(column)
                 np.lib.format.write_array_header_2_0(file, np.lib.format.header_data_from_array_1_0(column))
-                file.write(memoryview(column).cast("B"))
+                file.write(column.data)
         names = ("lengths", "tasks", "sources", "unfit", "ends_known", "notes")
         _report(out, columns=[*self.columns], **{name: getattr(self, name) for name in names})
 
