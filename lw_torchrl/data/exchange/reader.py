@@ -172,7 +172,10 @@ def read_parquet(source: Path, files: Files) -> None:
     files.require("action", seen)
     files.require("observation", seen)
     index = [name for name in ("episode_index", "frame_index", "task_index") if values.get(name) == rows]
-    texts = [name for name in TASK_NAMES if values.get(name) == rows and leaves[0][1][name][0] == name not in index]
+    plain = [
+        name for name in TASK_NAMES if all(columns.get(name, ("",))[0] == name for _, columns in leaves)
+    ]  # no lists
+    texts = [name for name in plain if values[name] == rows and name not in index]
     parts: dict[str, list[Array]] = {name: [] for name in (*chosen, *index, *texts)}
     for name in parts:
         files.reserve(name, 8 * values[name])
