@@ -172,7 +172,7 @@ def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) 
         empty.append(first)
         own = _own_lines(text, first[0], mapper.task) if ProseReading in group else text
         if len(group) > 1 and _has_control(*first, own):
-            other = _with_clauses(group[1], own, mapper)
+            other = _with_clauses(group[1], own, mapper, any_name=read is None)
             if group[1] is SentenceReading and all(clause.condition in (TRUE, FALSE) for clause in other[1].clauses):
                 other = first  # prose without any condition is not a plan
             empty.append(other)
@@ -186,8 +186,13 @@ def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) 
     return next((pair for pair in empty if pair[0].error), empty[0])
 
 
-def _with_clauses(read: Callable[[str], Reading], text: str, mapper: StepMapper) -> tuple[Reading, Section]:
-    """Parse a text, compile the programs for the task; return the result and its section with the most clauses."""
+def _with_clauses(
+    read: Callable[[str], Reading], text: str, mapper: StepMapper, any_name: bool = False
+) -> tuple[Reading, Section]:
+    """Parse a text, compile the programs for the task; return the result and its section with the most clauses.
+
+    With ``any_name``, a function whose name is not a task's is a plan for the task if the text has no other.
+    """
 
     def effect(skill: str) -> str | None:
         goal = mapper.query(skill.partition(" until ")[2]) if " until " in skill else None
@@ -204,6 +209,14 @@ def _with_clauses(read: Callable[[str], Reading], text: str, mapper: StepMapper)
     except (RecursionError, ProgramError) as error:
         reading = Reading(error=str(error) if isinstance(error, ProgramError) else "the text nests too deeply")
     own = [section for section in reading.sections if not section.task or _same(section.task, mapper.task)]
+    if any_name and not any(section.clauses or section.tree for section in own):
+        own = [
+            each
+            for each in reading.sections
+            if each.tree and not any(_same(each.task, task) for task in TASKS.values())
+        ]
+        for section in own:
+            reading.note(section.line, f"the function {shown(section.task)} is read as a plan for {mapper.task.name}")
     for section in own:
         if section.tree is not None:
             try:
