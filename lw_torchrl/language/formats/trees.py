@@ -171,8 +171,8 @@ class _Tree:
         self.count += 1
         if self.count > _MOST_VALUES:
             raise ValueError("too many values")
-        if isinstance(value, str | int) and not isinstance(value, bool):
-            return self.leaf(str(value).strip())
+        if isinstance(value, str):
+            return self.leaf(value.strip())
         if isinstance(value, list):
             if value and isinstance(value[0], str) and (kind := _TYPES.get(value[0].lower())):  # ["sequence", ...]
                 rest = value[1] if kind in ("condition", "action") and len(value) == 2 else value[1:]
@@ -222,12 +222,14 @@ class _Tree:
         for role in ("rules", "sequence", "remembered"):
             if isinstance(rules := _get(row, role), list | dict):
                 parts = tuple(self.children(rules))
-                last = self.node(_get(row, "otherwise"))
+                last = None if (other := _get(row, "otherwise")) is rules else self.node(other)
                 parts = parts if last is None else (*parts, last)
                 if role == "rules" or last is not None:
                     return Selector(parts)
                 if memory or role == "remembered":
                     return Sequence(parts, memory=True)
+                if parts and isinstance(parts[-1], Branch) and parts[-1].condition == TRUE:  # the last rule is the default
+                    return Selector(parts)
                 return (Block if any(isinstance(part, Branch) for part in parts) else Sequence)(parts)
         if condition is not None:
             test = negate(condition) if _is_true(_get(row, "negate")) else condition
