@@ -37,7 +37,9 @@ from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, STATES, TOUCHING, UNARY
 from lw_torchrl.language.tasks import Task, get_task
 
-_BEGINNINGS = {"is", "are", "isn't", "aren't", "not"} | {predicate.split()[0] for predicate in PREDICATES}  # of predicates
+_BEGINNINGS = {"is", "are", "isn't", "aren't", "not"} | {
+    predicate.split()[0] for predicate in PREDICATES
+}  # of predicates
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
 _OTHERS = frozenset(("(", *CONNECTIVES)) - {"and"}

@@ -6,23 +6,49 @@ import re
 from dataclasses import dataclass, field
 
 from lw_torchrl._util.checks import shown
-from lw_torchrl.language.expressions import Expression, as_expression, negate
-from lw_torchrl.language.formats.base import END, PROGRAM_WORDS, Reading, in_turn, is_verb
+from lw_torchrl.language.expressions import Expression, all_of, as_expression, negate
+from lw_torchrl.language.formats.base import END, PROGRAM_WORDS, Reading, in_turn, is_verb, statement
 from lw_torchrl.language.formats.prose import NO_SKILL
 from lw_torchrl.language.programs import Action, Block, Branch, Jump, Label, Loop, Node, Sequence, actions_of
 
-_ITEM = re.compile(r"(\s*)(?:(?:step\s+)?[\[(]?(\d{1,3})[.):\]]+|[-*•–+]|\(?[a-z][.)])\s+(.*)", re.IGNORECASE)
+_ITEM = re.compile(
+    r"(\s*)(?:(?:(?:step|case|rule)\s+)?[\[(]?(\d{1,3})[.):\]]+|[-*•–+]|\(?(?:[a-z]|[ivx]{2,4})[.)])\s+(.*)",
+    re.IGNORECASE,
+)
 _LONGEST = 1_000  # characters of a sentence
 _NO_PROSE = re.compile(r"""\s*(?:[#`~{}<]|['"]{3}|(?:def|class|import|from|return) (?!to\b)|[\w.]+(?:\(| = ))""")
+_HEADING = re.compile(r"\s*\*\*[^*]*\*\*:?\s*")
+_LABEL = re.compile(r"[\w ]{1,30}\s[–—-]\s(?=(?:otherwise|if|when|while|once|unless|as long)\b)", re.IGNORECASE)
 _LEAD = re.compile(
-    r"(?:then|next|first|finally|lastly|last|now|and|also|after that|in that case|please|just)\b,?\s+", re.I
+    r"(?:then|next|first|second|third|fourth|finally|lastly|last|now|and|also|after that|in that case|please|just|so)\b"
+    r",?\s+",
+    re.I,
 )
-_OTHERWISE = re.compile(r"(?:otherwise|or else|else|if not|in (?:all|any) other cases?)\b[,:]?\s*", re.IGNORECASE)
-_WHEN = re.compile(r"(if|when|whenever|once|while|as long as|as soon as|after|unless|until)\s+(.+)", re.IGNORECASE)
-_TRAILING = re.compile(r"(.+?),?\s(if|when|unless|as long as|whenever)\s(.+)", re.IGNORECASE)
+_CATCH_ALL = (
+    r"in (?:all|any|every) other (?:cases?|situations?)|anything else|(?:none|neither) of (?:the )?(?:above|these)"
+)
+_OTHERWISE = re.compile(
+    rf"(?:otherwise|or else|else|failing that|(?:if|when) (?:not|it is not|it isn't|neither holds|we don't)(?=,)|if not|"
+    rf"{_CATCH_ALL})(?:\b|(?<=\?))(?:[,:.?]| →)*\s*",
+    re.IGNORECASE,
+)
+_WHEN = re.compile(
+    r"(if|when|whenever|once|while|as long as|as soon as|after|unless|until|should)\s+(.+)", re.IGNORECASE
+)
+_TRAILING = re.compile(r"([^:]+?),?\s(if|when|unless|as long as|whenever)\s(.+)", re.IGNORECASE)
+_ANSWER = re.compile(
+    r"if (?:(so|yes|it is|it does)|(?:no|not|it isn't|it is not))(?=[,:]|\s(?:and|but)\b)"
+    r"(?:[,:]|\s(?:and|but) (it is)?(?:if )?)\s*",
+    re.IGNORECASE,
+)
+_ASKS = re.compile(r"(?:check|see|test|start by asking|ask|look) (?:whether|if) (.+)", re.IGNORECASE)
+_TELLS = re.compile(r"(?:the |its? )?[\w' ]+? (?:is|are|isn't|holds?) (.+)", re.IGNORECASE)
+_RELATION = re.compile(
+    r"\b(?:near|above|below|behind|aligned|around|open|closed|touching|(?:left|right|front) of)\b", re.I
+)
 _REPEAT = re.compile(
-    r"(?:repeat|loop|keep (?:going|repeating)|continue)\b"
-    r"(?:.*?\bsteps?\s+(\d+))?.*?\b(until|while|as long as)\s+(.+)",
+    r"(?:repeat|loop|keep (?:going|repeating|doing)|continue)\b"
+    r"(?:.*?\bsteps?\s+(\d+))?.*?\b(until|while|as long as)\s+([^:]+)(:?.*)",
     re.IGNORECASE,
 )
 _GO_TO = re.compile(r"(?:go|skip|return|jump|move|continue|proceed)\b.*?\bstep\s+(\d+)", re.IGNORECASE)
@@ -31,8 +57,18 @@ _SHOULD = re.compile(
     r"(?:then\s+|just\s+)?|(?:then|first|just|please|simply)\s+",
     re.IGNORECASE,
 )
-_SUBJECT = re.compile(r"(?:not\s+)?((?:the|a)\s[\w' -]+?)\s(?:is|are|has)\b", re.IGNORECASE)
+_DOES = re.compile(r"(?:it|(?:the )?robot|we|you|i) (\w+?)(s|es)?\b(?! \w+ing\b)", re.IGNORECASE)
+_SUBJECT = re.compile(r"(?:not\s+)?((?:the|a)\s[\w' -]+?)\s(?:is|are|has|isn't)\b", re.IGNORECASE)
+_OBJECT = re.compile(
+    r"\b(?:near|above|with|of|around|behind|below|to|at|on|onto) ((?:the )[\w' -]+?)"
+    r"(?= (?:and|or|but|is|are|isn't|nor|yet|if|when)\b|[,.;:)]|$)",
+    re.IGNORECASE,
+)
+_FILLER = re.compile(r"\s(?:already|still|yet|anymore|any more|now|either|also)\b(?! the)", re.IGNORECASE)
 _ENDS = re.compile(rf"(?:.*\b(?:and|then)\s)?(?:{'|'.join(PROGRAM_WORDS['prose']['ends'])})\b", re.IGNORECASE)
+_SENTENCES = re.compile(
+    r"(?<=[.;!?])\s+|\s{2,}(?=\d{1,2}[.)]\s)|,\s+(?=(?:otherwise|or else|else)\b)|,\s+and\s+(?=(?:if|when|once)\s(?:it|the)\b)"
+)
 
 
 @dataclass
@@ -61,33 +97,59 @@ class SentenceReading(Reading):
         super().__init__()
         self.root: list[_Part] = []
         self.scopes = [self.root]  # the innermost list to which sentences are added
-        self.step, self.subject, self.line = 0, "", 1
+        self.step, self.subject, self.object, self.line = 0, "", "", 1
+        self.questions = list[tuple[int, Expression]]()  # indent of the line, and the question, with those before it
         indents = [0]
-        for number, line in enumerate(text.splitlines(), 1):
+        for number, line in enumerate(text.replace("→", ",").splitlines(), 1):
             self.line = number
-            before, *cut = END.split("" if _NO_PROSE.match(line) else line, maxsplit=1)
-            item, indent = _ITEM.match(before), len(before) - len(before.lstrip())
-            while len(indents) > 1 and indent <= indents[-1]:
+            before, *cut = END.split("" if _NO_PROSE.match(line) or _HEADING.fullmatch(line) else line, maxsplit=1)
+            item, self.indent = _ITEM.match(before), len(before) - len(before.lstrip())
+            while len(indents) > 1 and self.indent <= indents[-1]:
                 indents.pop()
+            while self.questions and (not item or self.indent <= self.questions[-1][0]) and before.strip():
+                self.questions.pop()
             del self.scopes[len(indents) :]
             content = (item[3] if item else before).strip().replace("**", "").strip("\"'`")
             if item and item[2] and not indents[1:]:
                 self.step = int(item[2])
                 if not _OTHERWISE.match(content):
                     self.root.append(Label(item[2]))
-            for sentence in re.split(r"(?<=[.;!?])\s+|\s{2,}(?=\d{1,2}[.)]\s)", content):
-                self.sentence(sentence.strip(" .;!"))
+            sentences = [each.strip(" .;!,") for each in _SENTENCES.split(content)]
+            for sentence, after in zip(sentences, [*sentences[1:], ""], strict=True):
+                if not (after and self.ask(sentence, after, item is not None)):
+                    self.sentence(sentence)
             if content.endswith(":") and len(self.scopes) > len(indents):
-                indents.append(indent)
+                indents.append(self.indent)
             if cut:
                 break
         tree = (Sequence if self.step else Block)(tuple(_built(self.root)))
         if next(actions_of(tree), None) is not None:
             self.add_tree("", 1, tree)
 
+    def ask(self, text: str, after: str, is_item: bool) -> bool:
+        """Return whether a sentence asks a question or describes the case in which the sentences after it apply."""
+        asked = _ASKS.match(text)
+        if _WHEN.match(text) or _OTHERWISE.match(text) or not (asked or text.endswith("?") or is_item):
+            return False
+        told = text.partition(": ")[2] or text
+        if not asked and not text.endswith("?") and not (_TELLS.match(told) and _RELATION.search(told)):
+            return False
+        condition = self.condition(asked[1] if asked else told)
+        if _ANSWER.match(after):
+            self.questions.append((self.indent, condition))
+        else:
+            body = list[_Part]()
+            self.scopes[-1].append(_Choice([(condition, body)]))
+            self.scopes.append(body)
+        return True
+
     def sentence(self, text: str) -> None:
         """Add a sentence to the current scope."""
         if not text or len(text) > _LONGEST:
+            return
+        text = _LABEL.sub("", text, count=1) if _LABEL.match(text) else text
+        if self.questions and (answer := _ANSWER.match(text)):
+            self.answer(answer, text[answer.end() :])
             return
         while lead := _LEAD.match(text):
             text = text[lead.end() :]
@@ -96,17 +158,43 @@ class SentenceReading(Reading):
         chain = next((each for each in reversed(scope) if not isinstance(each, Label)), None)
         if other and isinstance(chain, _Choice) and chain.otherwise is None:
             text = text[other.end() :]
+            if re.match(_CATCH_ALL, other[0], re.IGNORECASE):
+                chain = _merged(scope)
         else:
             chain, text = None, text[other.end() :] if other else text
+        while lead := _LEAD.match(text):
+            text = text[lead.end() :]
+        if self.questions and (answer := _ASKS.match(text)):
+            self.questions.append((self.indent, all_of([self.questions[-1][1], self.condition(answer[1])])))
+            return
         repeat = _REPEAT.match(text)
         if repeat and chain is None:
-            condition = _condition(repeat[3])
+            condition = self.condition(repeat[3])
             condition = negate(condition) if repeat[2].lower() == "until" else condition
-            self.root.append(_Repeat(repeat[1] or "", condition))
-        elif (when := _WHEN.match(text)) and (parts := _split(when[2])):
+            if not repeat[4]:
+                self.root.append(_Repeat(repeat[1] or "", condition))
+            elif repeat[4][1:]:
+                self.sentence(repeat[4][1:].strip())
+            return
+        head, colon, rest = text.partition(": ")
+        if colon and not _WHEN.match(text):
+            if _RELATION.search(head) and not is_verb(head.split()):
+                self.conditional("if", head, rest, chain)
+                return
+            if _WHEN.match(rest):
+                self.scopes.append(scope if chain is None else [])
+                if chain is not None:
+                    chain.otherwise = self.scopes[-1]
+                self.sentence(rest)
+                return
+        if (when := _WHEN.match(text)) and (parts := self.split(when[2])):
             self.conditional(when[1].lower(), *parts, chain)
-        elif (when := _TRAILING.match(text)) and is_verb(when[1].split()) and not re.search(r"\buntil\b", when[1]):
-            self.conditional(when[2].lower(), when[3], when[1], chain)
+        elif (
+            (when := _TRAILING.match(text))
+            and is_verb(_imperative(when[1]).split())
+            and not re.search(r"\buntil\b", when[1])
+        ):
+            self.trailing(when, chain)
         elif chain is not None:
             chain.otherwise = []
             self.body(text, chain.otherwise)
@@ -117,10 +205,75 @@ class SentenceReading(Reading):
         elif text.endswith(":") and _WHEN.match(text):
             self.conditional("if", text[:-1].split(" ", 1)[1], "", chain)
 
+    def answer(self, answer: re.Match[str], text: str) -> None:
+        """Add a sentence that answers a question: "if so, ...", "if not, ..."."""
+        indent, question = self.questions[-1]
+        guard = question if answer[1] else negate(question)
+        if asked := _ASKS.match(text):
+            self.questions.append((self.indent, all_of([guard, self.condition(asked[1])])))
+            return
+        body = list[_Part]()
+        self.scopes[-1].append(_Choice([(guard, body)]))
+        self.scopes.append(body)
+        self.sentence(
+            f"if it is {text}" if answer[2] else text if _is_imperative(text) or _WHEN.match(text) else f"if {text}"
+        )
+        self.scopes.pop()
+
+    def trailing(self, when: re.Match[str], chain: _Choice | None) -> None:
+        """Add actions with their conditions behind them: "hold it if C, lift it if D, or lower it otherwise"."""
+        action, word, rest = when.groups()
+        first, *exception = re.split(r",\s+or\s+", action, maxsplit=1)
+        if exception and is_verb(exception[0].split()):  # "move it, or lift it if C"
+            self.conditional(word.lower(), rest, exception[0], chain)
+            self.sentence(f"otherwise, {first}")
+            return
+        condition, *others = re.split(
+            r",\s+(?:(?:and|or|else)\s+)*(?=(?!not\b)\w+\b.*(?:\sif\s|\swhen\s|\sotherwise$|\sif it is$))",
+            rest,
+            maxsplit=1,
+        )
+        if others and not is_verb(others[0].split()):
+            head = " ".join(action.split(" ")[:2])
+            others = [f"{head} {others[0]}"] if others[0].endswith(" otherwise") else []
+            condition = condition if others else rest
+        match = re.match(
+            r"\w+ ((?:the|a) [\w' ]+?)(?: (?:above|to|over|into|onto|around|down|up|from|in|of|off|at)\b|$)", action
+        )
+        self.subject = match[1] if match else self.subject
+        self.conditional(word.lower(), condition, action, chain)
+        if others:
+            last = re.sub(r"\s(?:otherwise|if it is)$", "", others[0])
+            self.sentence(f"otherwise, {last}")
+
+    def condition(self, text: str) -> Expression:
+        """Convert a condition in English; "it" is the last subject or object."""
+        if (inside := re.search(r"\(([^()]* (?:is|are) [^()]*)\)", text)) and not re.search(
+            r"\b(?:not|or|and|is)\s*$", text[: inside.start()]
+        ):
+            text = inside[1]  # "the puck is in the gripper (the gripper is near the puck and closed)"
+        text = statement(" ".join(text.split()).rstrip(",:"))
+        text = _FILLER.sub("", re.sub(r",?\s(?:but|though|yet)\s", " and ", f" {text}")).strip()
+        text = re.sub(r",\s(?=(?:or|and)\b)", " ", text)
+        self.subject = match[1] if (match := _SUBJECT.match(text)) else self.subject or "the gripper"
+        text = re.sub(r"(?<![\w'] )\b(it|its gripper)(?= (?:is|isn't|has)\b)", self.subject, text, flags=re.IGNORECASE)
+        text = re.sub(r"\b(and|or|that|neither|if) it(?= (?:is|isn't)\b)", rf"\1 {self.subject}", text)
+        names = [self.object]
+        for match in _OBJECT.finditer(text):
+            names.append(match[1])
+        self.object = names[-1]
+        if self.object:
+            text = re.sub(
+                r"\b(near|above|with|of|around|behind|below) it\b",
+                rf"\1 {names[1] if names[1:] else self.object}",
+                text,
+            )
+        return as_expression(text)
+
     def conditional(self, word: str, condition: str, action: str, chain: _Choice | None) -> None:
         """Add a sentence with a condition."""
-        self.subject = match[1] if (match := _SUBJECT.match(condition)) else self.subject
-        test, body = _condition(condition), list[_Part]()
+        condition = re.sub(r"^(.+?) be ", r"\1 is ", condition) if word == "should" else condition
+        test, body = self.condition(condition), list[_Part]()
         test = negate(test) if word in ("unless", "until") else test
         scope = self.scopes[-1]
         if chain is not None:
@@ -139,11 +292,11 @@ class SentenceReading(Reading):
             if rest:
                 self.sentence(rest.strip())
             return
-        if _WHEN.match(text):
+        if _WHEN.match(text) or ((when := _TRAILING.match(text)) and "until" not in when[1]):
             self.scopes.append(body)
             self.sentence(text)
             return
-        text = _SHOULD.sub("", text, count=1) if _SHOULD.match(text) else text
+        text = _imperative(text)
         text = text.removesuffix(" instead")
         if text.split(" ")[0].lower() in NO_SKILL:
             self.note(self.line, f"{shown(text)} is left out: it is not an action")
@@ -151,11 +304,26 @@ class SentenceReading(Reading):
         for action in actions_of(in_turn(text, self.line)):
             self.action(action, body)
 
+    def split(self, text: str) -> tuple[str, str] | None:
+        """Split "the gripper is open, close it" into the condition and the action."""
+        places = [match for match in re.finditer(r",\s+|:\s+|\s+then\s+", text)]
+        for match in places:
+            after = text[match.end() :]
+            if is_verb(_imperative(after).split()) or _WHEN.match(after) or _SHOULD.match(after):
+                return text[: match.start()], after
+        if places:
+            return text[: places[-1].start()], text[places[-1].end() :]
+        return (text[:-1], "") if text.endswith(":") else None
+
     def action(self, action: Action, body: list[_Part]) -> None:
         text = action.text.strip()
         if go_to := _GO_TO.match(text):
             body.append(Jump(go_to[1] if int(go_to[1]) > self.step else ""))
         elif text.lower() not in PROGRAM_WORDS["prose"]["continues"]:
+            if text.lower() in ("close", "open"):
+                text += f" {self.subject or 'the gripper'}"
+            if " until " in text:
+                text = re.sub(r"\buntil it (is|isn't)\b", rf"until {self.subject or 'the gripper'} \1", text)
             if self.subject and not any(isinstance(each, Action) for each in body):
                 text = re.sub(r"^(\w+) it\b", rf"\1 {self.subject}", text)
             body.append(Action(text, action.line))
@@ -170,25 +338,32 @@ def _last_action(parts: list[_Part]) -> list[_Part]:
     return parts if parts and isinstance(parts[-1], Action) else []
 
 
-def _split(text: str) -> tuple[str, str] | None:
-    """Split "the gripper is open, close it" into the condition and the action."""
-    places = [match for match in re.finditer(r",\s+|:\s+|\s+then\s+", text)]
-    for match in places:
-        words = _SHOULD.sub("", text[match.end() :], count=1).split()
-        if is_verb(words) or _WHEN.match(text, match.end()) or _SHOULD.match(text, match.end()):
-            return text[: match.start()], text[match.end() :]
-    if places:
-        return text[: places[-1].start()], text[places[-1].end() :]
-    return (text[:-1], "") if text.endswith(":") else None
+def _merged(scope: list[_Part]) -> _Choice:
+    """Join the choices at the end of a scope into one chain, for "in all other cases"."""
+    chain = _Choice()
+    while scope and isinstance(scope[-1], Label | _Choice):
+        part = scope.pop()
+        if isinstance(part, _Choice):
+            if part.otherwise is not None:
+                scope.append(part)
+                break
+            chain.branches = part.branches + chain.branches
+    scope.append(chain)
+    return chain
+
+
+def _imperative(text: str) -> str:
+    """Return "push it" for "the robot should push it" and "it pushes it"."""
+    text = _SHOULD.sub("", text, count=1) if _SHOULD.match(text) else text
+    if does := _DOES.match(text):
+        verbs = (does[1], does[1] + (does[2] or "")[:-1])
+        return next((verb + text[does.end() :] for verb in verbs if is_verb([verb])), text)
+    return text
 
 
 def _is_imperative(text: str) -> bool:
-    words = (_SHOULD.sub("", text, count=1) if _SHOULD.match(text) else text).split()
+    words = _imperative(text).split()
     return (is_verb(words) and 1 < len(words) <= 40) or " ".join(words).lower() in PROGRAM_WORDS["prose"]["ends"]
-
-
-def _condition(text: str) -> Expression:
-    return as_expression(" ".join(text.split()).rstrip(",:"))
 
 
 def _built(parts: list[_Part]) -> list[Node]:

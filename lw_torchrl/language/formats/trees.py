@@ -228,7 +228,9 @@ class _Tree:
                     return Selector(parts)
                 if memory or role == "remembered":
                     return Sequence(parts, memory=True)
-                if parts and isinstance(parts[-1], Branch) and parts[-1].condition == TRUE:  # the last rule is the default
+                if (
+                    parts and isinstance(parts[-1], Branch) and parts[-1].condition == TRUE
+                ):  # the last rule is the default
                     return Selector(parts)
                 return (Block if any(isinstance(part, Branch) for part in parts) else Sequence)(parts)
         if condition is not None:
