@@ -158,6 +158,11 @@ _GROUPS: tuple[tuple[Callable[[str], Reading], ...], ...] = (
     (ProseReading, SentenceReading),
 )
 _CONTROL_WORDS = re.compile(r"\b(?:otherwise|or else|else,|unless)\b|\bgo (?:on |back )?to step\b", re.IGNORECASE)
+# The published formats have none of these: questions, and conditions behind an action.
+_FREE_WORDS = re.compile(
+    r"\?|\bif (?:so|not|it isn't)\b|^[ \t]*(?:\W+|\d+[.)] )?(?!when|if|once|while|as |the task)\w[^.\n]* (?:if|until|when) ",
+    re.IGNORECASE | re.MULTILINE,
+)
 
 
 def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) -> tuple[Reading, Section]:
@@ -171,7 +176,8 @@ def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) 
         best = first = _with_clauses(group[0], text, mapper)
         empty.append(first)
         own = _own_lines(text, first[0], mapper.task) if ProseReading in group else text
-        if len(group) > 1 and _has_control(*first, own):
+        is_free = read is None and ProseReading in group and _FREE_WORDS.search(own) is not None
+        if len(group) > 1 and (is_free or _has_control(*first, own)):
             other = _with_clauses(group[1], own, mapper, any_name=read is None)
             if group[1] is SentenceReading and all(clause.condition in (TRUE, FALSE) for clause in other[1].clauses):
                 other = first  # prose without any condition is not a plan
