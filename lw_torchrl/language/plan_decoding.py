@@ -9,7 +9,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from lw_torchrl._util.checks import check_choice, counted, shown, typed
-from lw_torchrl.language.expressions import FALSE, TRUE, Expression, count_mentions, leaves, replace_leaves
+from lw_torchrl.language.expressions import (
+    FALSE,
+    TRUE,
+    Expression,
+    all_of,
+    as_expression,
+    count_mentions,
+    leaves,
+    negate,
+    replace_leaves,
+)
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, listed_steps
 from lw_torchrl.language.formats.code import CodeReading
@@ -64,6 +74,7 @@ class DecodedPlan:
         return self.plan is not None and self.scripted is not None and len(self.scripted.steps) == len(self.plan.steps)
 
 
+_MOST_COMPARED = 16  # maximum number of conditions in a guard that is compared with an effect
 _LONGEST = 65_536  # maximum number of characters to parse
 
 
@@ -182,8 +193,11 @@ def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) 
             if group[1] is SentenceReading and all(clause.condition in (TRUE, FALSE) for clause in other[1].clauses):
                 other = first  # prose without any condition is not a plan
             empty.append(other)
+            known = mapper if ProseReading in group else None
             best = max(
-                first, other, key=lambda pair: (_kept(pair[1]), -len(_section_notes(pair[0], pair[1], mapper.task)))
+                first,
+                other,
+                key=lambda pair: (_kept(pair[1], known), -len(_section_notes(pair[0], pair[1], mapper.task))),
             )
         if best[1].clauses:
             if number and read is not None:
@@ -210,6 +224,12 @@ def _with_clauses(
             return None if query is None else str(query)
         return None
 
+    def is_done(guard: Expression, effect: str) -> bool:
+        if len(leaves(guard)) > _MOST_COMPARED:
+            return False
+        mapped = replace_leaves(guard, lambda leaf: _expression(mapper, leaf))
+        return all_of([mapped, negate(_expression(mapper, effect))]) == FALSE
+
     try:
         reading = read(text)
     except (RecursionError, ProgramError) as error:
@@ -226,7 +246,9 @@ def _with_clauses(
     for section in own:
         if section.tree is not None:
             try:
-                steps = compile_program(section.tree, effect, lambda text: mapper.query(text).query is not None)
+                steps = compile_program(
+                    section.tree, effect, lambda text: mapper.query(text).query is not None, is_done
+                )
             except ProgramError as error:
                 reading.error = str(error)
                 continue
@@ -236,9 +258,18 @@ def _with_clauses(
     return reading, max(own or [Section("", 1)], key=_kept)
 
 
-def _kept(section: Section) -> int:
-    """Return how many clauses of a section can be active."""
-    return sum(clause.condition != FALSE for clause in section.clauses)
+def _expression(mapper: StepMapper, leaf: Any) -> Expression:
+    query = mapper.query(leaf).query if isinstance(leaf, str) else None
+    return as_expression(str(leaf)) if query is None else query.expression
+
+
+def _kept(section: Section, mapper: StepMapper | None = None) -> int:
+    """Return how many clauses of a section can be active; with a mapper, unknown conditions are never true."""
+    conditions = [clause.condition for clause in section.clauses]
+    return sum(
+        each != FALSE and not (mapper and isinstance(each, str) and mapper.query(each).query is None)
+        for each in conditions
+    )
 
 
 def _has_control(reading: Reading, section: Section, text: str) -> bool:

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, field
 
 from lw_torchrl._util.checks import shown
-from lw_torchrl.language.expressions import Expression, all_of, as_expression, negate
+from lw_torchrl.language.expressions import TRUE, Expression, all_of, as_expression, negate
 from lw_torchrl.language.formats.base import END, PROGRAM_WORDS, Reading, in_turn, is_verb, statement
 from lw_torchrl.language.formats.prose import NO_SKILL
 from lw_torchrl.language.programs import Action, Block, Branch, Jump, Label, Loop, Node, Sequence, actions_of
@@ -51,7 +51,7 @@ _REPEAT = re.compile(
     r"(?:.*?\bsteps?\s+(\d+))?.*?\b(until|while|as long as)\s+([^:]+)(:?.*)",
     re.IGNORECASE,
 )
-_GO_TO = re.compile(r"(?:go|skip|return|jump|move|continue|proceed)\b.*?\bstep\s+(\d+)", re.IGNORECASE)
+_GO_TO = re.compile(r"(?:go|skip|return|jump|move|continue|proceed|begin|start)\b.*?\bstep\s+(\d+)", re.IGNORECASE)
 _SHOULD = re.compile(
     r"(?:then\s+)?(?:the\s+)?(?:robot|it|you|we)\s+(?:should|must|needs? to|has to|have to|will|can|shall)\s+"
     r"(?:then\s+|just\s+)?|(?:then|first|just|please|simply)\s+",
@@ -64,10 +64,16 @@ _OBJECT = re.compile(
     r"(?= (?:and|or|but|is|are|isn't|nor|yet|if|when)\b|[,.;:)]|$)",
     re.IGNORECASE,
 )
+_TOPIC = re.compile(r"(?:look at|where is|what about|consider) (the [\w' ]+)", re.IGNORECASE)
+_ACTED = re.compile(
+    r"\w+ ((?:the|a) [\w' ]+?)(?: (?:above|to|over|into|onto|around|down|up|from|in|of|off|at|until|if|when)\b|$)",
+    re.IGNORECASE,
+)
 _FILLER = re.compile(r"\s(?:already|still|yet|anymore|any more|now|either|also)\b(?! the)", re.IGNORECASE)
 _ENDS = re.compile(rf"(?:.*\b(?:and|then)\s)?(?:{'|'.join(PROGRAM_WORDS['prose']['ends'])})\b", re.IGNORECASE)
 _SENTENCES = re.compile(
-    r"(?<=[.;!?])\s+|\s{2,}(?=\d{1,2}[.)]\s)|,\s+(?=(?:otherwise|or else|else)\b)|,\s+and\s+(?=(?:if|when|once)\s(?:it|the)\b)"
+    r"(?<=[.;!?])\s+|\s{2,}(?=\d{1,2}[.)]\s)|,\s+(?=(?:otherwise|or else|else)\b)"
+    r"|(?:,\s+and|\s+and,)\s+(?=(?:if|when|once)\s(?:it|the)\b)"
 )
 
 
@@ -98,9 +104,11 @@ class SentenceReading(Reading):
         self.root: list[_Part] = []
         self.scopes = [self.root]  # the innermost list to which sentences are added
         self.step, self.subject, self.object, self.line = 0, "", "", 1
-        self.questions = list[tuple[int, Expression]]()  # indent of the line, and the question, with those before it
+        # The indent of the line, the question, and the answers above it.
+        self.questions = list[tuple[int, Expression, Expression]]()
+        self.guard = TRUE  # the answers that the current sentence depends on
         indents = [0]
-        for number, line in enumerate(text.replace("→", ",").splitlines(), 1):
+        for number, line in enumerate(re.sub(r"[ \t]*→[ \t]*", ", ", text).splitlines(), 1):
             self.line = number
             before, *cut = END.split("" if _NO_PROSE.match(line) or _HEADING.fullmatch(line) else line, maxsplit=1)
             item, self.indent = _ITEM.match(before), len(before) - len(before.lstrip())
@@ -109,15 +117,12 @@ class SentenceReading(Reading):
             while self.questions and (not item or self.indent <= self.questions[-1][0]) and before.strip():
                 self.questions.pop()
             del self.scopes[len(indents) :]
-            content = (item[3] if item else before).strip().replace("**", "").strip("\"'`")
+            content = (item[3] if item else before).strip().replace("*", "").strip("\"'`")
             if item and item[2] and not indents[1:]:
                 self.step = int(item[2])
                 if not _OTHERWISE.match(content):
                     self.root.append(Label(item[2]))
-            sentences = [each.strip(" .;!,") for each in _SENTENCES.split(content)]
-            for sentence, after in zip(sentences, [*sentences[1:], ""], strict=True):
-                if not (after and self.ask(sentence, after, item is not None)):
-                    self.sentence(sentence)
+            self.sentences(content, item is not None, len(indents))
             if content.endswith(":") and len(self.scopes) > len(indents):
                 indents.append(self.indent)
             if cut:
@@ -126,22 +131,44 @@ class SentenceReading(Reading):
         if next(actions_of(tree), None) is not None:
             self.add_tree("", 1, tree)
 
-    def ask(self, text: str, after: str, is_item: bool) -> bool:
-        """Return whether a sentence asks a question or describes the case in which the sentences after it apply."""
-        asked = _ASKS.match(text)
-        if _WHEN.match(text) or _OTHERWISE.match(text) or not (asked or text.endswith("?") or is_item):
+    def sentences(self, content: str, is_item: bool, base: int) -> None:
+        """Add the sentences of a line; ``base`` is the number of scopes that stay open between sentences."""
+        parts = _SENTENCES.split(content)
+        while parts:
+            part, after = parts.pop(0), parts[0] if parts else ""
+            text = part.strip(" .;!,")
+            other = _OTHERWISE.match(text)
+            if topic := _TOPIC.match(text):
+                self.subject = topic[1]
+            elif asked := _ASKS.match(text):
+                self.questions.append((self.indent, self.condition(asked[1]), TRUE))
+            elif text.endswith("?") and _ANSWER.match(after):
+                self.questions.append((self.indent, self.condition(text), TRUE))
+            elif after and text.endswith("?") and not (other and other.end() == len(text)):
+                asked_after = (other[0], text[other.end() :]) if other else ("", text)
+                parts[0] = f"{asked_after[0]}if {statement(asked_after[1])}, {after}"
+            elif after and other and other.end() == len(text):  # "None of these?"
+                parts[0] = f"in all other cases, {after}"
+            elif after and self.is_case(text, is_item, after):
+                body = list[_Part]()
+                self.scopes[-1].append(_Choice([(self.condition(text.rpartition(": ")[2]), body)]))
+                self.scopes.append(body)
+                base += 1
+            else:
+                self.sentence(text)
+                if text.lower().endswith(tuple(PROGRAM_WORDS["prose"]["details"])):
+                    base = len(self.scopes)
+                elif part.endswith(".") and not _OTHERWISE.match(after):
+                    del self.scopes[base:]
+
+    def is_case(self, text: str, is_item: bool, after: str) -> bool:
+        """Return whether a sentence describes the case in which the sentences after it apply."""
+        if _WHEN.match(text) or _OTHERWISE.match(text) or not (is_item or after.lower().startswith("in that case")):
             return False
-        told = text.partition(": ")[2] or text
-        if not asked and not text.endswith("?") and not (_TELLS.match(told) and _RELATION.search(told)):
-            return False
-        condition = self.condition(asked[1] if asked else told)
-        if _ANSWER.match(after):
-            self.questions.append((self.indent, condition))
-        else:
-            body = list[_Part]()
-            self.scopes[-1].append(_Choice([(condition, body)]))
-            self.scopes.append(body)
-        return True
+        told = text.rpartition(": ")[2]
+        return (
+            not _WHEN.match(told) and not _is_imperative(told) and bool(_TELLS.match(told) and _RELATION.search(told))
+        )
 
     def sentence(self, text: str) -> None:
         """Add a sentence to the current scope."""
@@ -149,8 +176,21 @@ class SentenceReading(Reading):
             return
         text = _LABEL.sub("", text, count=1) if _LABEL.match(text) else text
         if self.questions and (answer := _ANSWER.match(text)):
-            self.answer(answer, text[answer.end() :])
+            _, question, guard = self.questions[-1]
+            self.guarded(
+                all_of([guard, question if answer[1] else negate(question)]), text[answer.end() :], bool(answer[2])
+            )
             return
+        if (
+            self.questions
+            and self.guard == TRUE
+            and self.questions[-1][2] != TRUE
+            and self.questions[-1][0] < self.indent
+        ):
+            self.guarded(self.questions[-1][2], text)
+            return
+        if re.match(r"and (?:it|the [\w' ]+?) (?:is|isn't)\b", text):
+            text = f"if {text[4:]}"
         while lead := _LEAD.match(text):
             text = text[lead.end() :]
         scope = self.scopes[-1]
@@ -164,9 +204,6 @@ class SentenceReading(Reading):
             chain, text = None, text[other.end() :] if other else text
         while lead := _LEAD.match(text):
             text = text[lead.end() :]
-        if self.questions and (answer := _ASKS.match(text)):
-            self.questions.append((self.indent, all_of([self.questions[-1][1], self.condition(answer[1])])))
-            return
         repeat = _REPEAT.match(text)
         if repeat and chain is None:
             condition = self.condition(repeat[3])
@@ -187,7 +224,10 @@ class SentenceReading(Reading):
                     chain.otherwise = self.scopes[-1]
                 self.sentence(rest)
                 return
-        if (when := _WHEN.match(text)) and (parts := self.split(when[2])):
+        if (when := _WHEN.match(text)) and (parts := self.split(when[2])) and (asked := _ASKS.match(parts[1])):
+            guard = all_of([self.guard, self.condition(parts[0])])
+            self.questions.append((self.indent, self.condition(asked[1]), guard))
+        elif (when := _WHEN.match(text)) and (parts := self.split(when[2])):
             self.conditional(when[1].lower(), *parts, chain)
         elif (
             (when := _TRAILING.match(text))
@@ -197,7 +237,10 @@ class SentenceReading(Reading):
             self.trailing(when, chain)
         elif chain is not None:
             chain.otherwise = []
-            self.body(text, chain.otherwise)
+            if _is_imperative(text) or not _TELLS.match(text):
+                self.body(text, chain.otherwise)
+            else:  # "otherwise the gripper is on the wrong side; ..."
+                self.scopes.append(chain.otherwise)
         elif _is_imperative(text):
             self.body(text, scope)
         elif _WHEN.match(text) and not text.endswith(":"):
@@ -205,19 +248,18 @@ class SentenceReading(Reading):
         elif text.endswith(":") and _WHEN.match(text):
             self.conditional("if", text[:-1].split(" ", 1)[1], "", chain)
 
-    def answer(self, answer: re.Match[str], text: str) -> None:
-        """Add a sentence that answers a question: "if so, ...", "if not, ..."."""
-        indent, question = self.questions[-1]
-        guard = question if answer[1] else negate(question)
+    def guarded(self, guard: Expression, text: str, continues: bool = False) -> None:
+        """Add a sentence, or ask a question, under a condition."""
         if asked := _ASKS.match(text):
-            self.questions.append((self.indent, all_of([guard, self.condition(asked[1])])))
+            self.questions.append((self.indent, self.condition(asked[1]), guard))
             return
         body = list[_Part]()
         self.scopes[-1].append(_Choice([(guard, body)]))
         self.scopes.append(body)
-        self.sentence(
-            f"if it is {text}" if answer[2] else text if _is_imperative(text) or _WHEN.match(text) else f"if {text}"
-        )
+        before, self.guard = self.guard, guard
+        is_whole = _is_imperative(text) or _WHEN.match(text)
+        self.sentence(f"if it is {text}" if continues else text if is_whole else f"if {text}")
+        self.guard = before
         self.scopes.pop()
 
     def trailing(self, when: re.Match[str], chain: _Choice | None) -> None:
@@ -225,6 +267,7 @@ class SentenceReading(Reading):
         action, word, rest = when.groups()
         first, *exception = re.split(r",\s+or\s+", action, maxsplit=1)
         if exception and is_verb(exception[0].split()):  # "move it, or lift it if C"
+            self.subject = match[1] if (match := _ACTED.match(exception[0])) else self.subject
             self.conditional(word.lower(), rest, exception[0], chain)
             self.sentence(f"otherwise, {first}")
             return
@@ -237,14 +280,13 @@ class SentenceReading(Reading):
             head = " ".join(action.split(" ")[:2])
             others = [f"{head} {others[0]}"] if others[0].endswith(" otherwise") else []
             condition = condition if others else rest
-        match = re.match(
-            r"\w+ ((?:the|a) [\w' ]+?)(?: (?:above|to|over|into|onto|around|down|up|from|in|of|off|at)\b|$)", action
-        )
-        self.subject = match[1] if match else self.subject
+        self.subject = match[1] if (match := _ACTED.match(action)) else self.subject
         self.conditional(word.lower(), condition, action, chain)
         if others:
-            last = re.sub(r"\s(?:otherwise|if it is)$", "", others[0])
-            self.sentence(f"otherwise, {last}")
+            is_last = not re.search(r"\s(?:if|when)\s", others[0])
+            self.sentence(
+                "otherwise, " + (re.sub(r"\s(?:otherwise|if it is)$", "", others[0]) if is_last else others[0])
+            )
 
     def condition(self, text: str) -> Expression:
         """Convert a condition in English; "it" is the last subject or object."""
@@ -253,9 +295,13 @@ class SentenceReading(Reading):
         ):
             text = inside[1]  # "the puck is in the gripper (the gripper is near the puck and closed)"
         text = statement(" ".join(text.split()).rstrip(",:"))
-        text = _FILLER.sub("", re.sub(r",?\s(?:but|though|yet)\s", " and ", f" {text}")).strip()
+        text = re.sub(r",?\s(?:but|though|although)\s", ", and ", _FILLER.sub("", f" {text}")).strip()
+        text = re.sub(r",\s(?=(?:the|it)\b[^,]* (?:is|isn't)\b)", " and ", text)
+        text = re.sub(r"^([^()]*\bor\b[^()]*),\sand\s(.*)$", r"(\1) and \2", text)  # "A or B, and C"
         text = re.sub(r",\s(?=(?:or|and)\b)", " ", text)
-        self.subject = match[1] if (match := _SUBJECT.match(text)) else self.subject or "the gripper"
+        if match := _SUBJECT.match(text):
+            self.subject = match[1][0].lower() + match[1][1:]
+        self.subject = self.subject or "the gripper"
         text = re.sub(r"(?<![\w'] )\b(it|its gripper)(?= (?:is|isn't|has)\b)", self.subject, text, flags=re.IGNORECASE)
         text = re.sub(r"\b(and|or|that|neither|if) it(?= (?:is|isn't)\b)", rf"\1 {self.subject}", text)
         names = [self.object]
@@ -323,7 +369,8 @@ class SentenceReading(Reading):
             if text.lower() in ("close", "open"):
                 text += f" {self.subject or 'the gripper'}"
             if " until " in text:
-                text = re.sub(r"\buntil it (is|isn't)\b", rf"until {self.subject or 'the gripper'} \1", text)
+                acted = match[1] if (match := _ACTED.match(text)) else self.subject or "the gripper"
+                text = re.sub(r"\buntil it (is|isn't)\b", rf"until {acted} \1", text)
             if self.subject and not any(isinstance(each, Action) for each in body):
                 text = re.sub(r"^(\w+) it\b", rf"\1 {self.subject}", text)
             body.append(Action(text, action.line))
