@@ -362,14 +362,15 @@ def _mapped_guard(clause: Clause, mapper: StepMapper, notes: list[Note]) -> tupl
         if isinstance(leaf, Done):
             effect = skill_effect(leaf.text, mapper.task)
             return FALSE if effect is None else effect.expression
-        is_new = leaf not in mapper.mapped
         mapped, distance, exact = mapper.query(leaf)
         distances.append(distance)
         if mapped is None:
             unknown.append(leaf)
-        if is_new and not exact:
+        if not exact:
             how = "counts as never true" if mapped is None else f"is read as {str(mapped)!r}"
-            notes.append(Note(clause.line, f"the condition {shown(leaf)} {how} (distance {distance:.2f})"))
+            text = f"the condition {shown(leaf)} {how} (distance {distance:.2f})"
+            if all(note.text != text for note in notes):
+                notes.append(Note(clause.line, text))
         return FALSE if mapped is None else mapped.expression
 
     if len(leaves(guard)) > MOST_CLAUSES:
