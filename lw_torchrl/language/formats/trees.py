@@ -40,6 +40,7 @@ _TYPES = {word: kind for kind, words in PROGRAM_WORDS["types"].items() for word 
 _MOST_VALUES = 20_000  # YAML's references can repeat a value
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|//[^\n]*|/\*.*?\*/|#[^\n]*|[^"\[\]{},/#]+|.', re.DOTALL)
 _YAML = re.compile(r"^\s*(?:- )?[\w -]{1,40}:(?:\s|$)", re.MULTILINE)
+_CODE = re.compile(r"^\s*(?:async )?(?:def|class) \w", re.MULTILINE)
 
 
 class TreeReading(Reading):
@@ -71,9 +72,9 @@ class TreeReading(Reading):
         """Parse JSON or YAML; None if the text is neither."""
         bracket = re.search(r"[{\[]", block)
         before = block if bracket is None else block[: bracket.start()]
-        is_yaml = len(_YAML.findall(before)) > 1
+        is_yaml = len(_YAML.findall(before)) > 1 and not _CODE.search(block)
         value = None if is_yaml or bracket is None else _json(block[bracket.start() :])
-        if value is not None or len(_YAML.findall(block)) < 2:
+        if value is not None or len(_YAML.findall(block)) < 2 or _CODE.search(block):
             return value
         try:
             return _yaml(block)
