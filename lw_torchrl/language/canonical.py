@@ -128,7 +128,7 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     read = _with_roles(plan, parsed)
     confidence, motion = confidence_of(task, read), _final_motion(read)
     source: Source
-    if confidence >= MIN_CONFIDENCE and is_complete(read):
+    if confidence >= MIN_CONFIDENCE and is_complete(task, read):
         source, steps = "plan", read
     elif motion is not None:
         source, steps = "completed", completed(task, read, motion)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from lw_torchrl.language.confidence import role_of, touched_point
+from lw_torchrl.language.confidence import moves_before_grasp, role_of, touched_point
 from lw_torchrl.language.expressions import Expression, all_of, any_of, leaves, negate
 from lw_torchrl.language.objects import GOAL, GRIPPER
 from lw_torchrl.language.plans import PlanStep
@@ -27,16 +27,22 @@ def negated(query: Query) -> Query:
     return Query(negate(query.expression))
 
 
-def is_complete(steps: Sequence[PlanStep]) -> bool:
-    """Return whether a plan has a motion and, if the motion needs a grasp, first approaches and grasps the object."""
+def is_complete(task: Task, steps: Sequence[PlanStep]) -> bool:
+    """Return whether a plan has a motion and, if the motion needs a grasp, first approaches and grasps the object.
+
+    The list shows what comes first, or else the conditions: no step moves the object before it is grasped.
+    """
     roles = [role_of(step) for step in steps]
     verbs = [role.verb for role in roles]
-    moving = next((number for number, verb in enumerate(verbs) if verb in ("carry", "move")), None)
     if any(role.verb == "pull" and "handle" not in role.target.split() for role in roles):
         return False  # a handle can be hooked; any other object must be grasped before pulling
-    if moving is None:
+    if {"carry", "move"}.isdisjoint(verbs):
         return motion_of(roles) is not None
-    return "close" in verbs[:moving] and not {"approach", "descend"}.isdisjoint(verbs[: verbs.index("close")])
+    if "close" not in verbs or {"approach", "descend"}.isdisjoint(verbs):
+        return False
+    first, close = (min(map(verbs.index, {*verbs} & {*group})) for group in (("carry", "move"), ("close",)))
+    in_order = close < first and not {"approach", "descend"}.isdisjoint(verbs[:close])
+    return in_order or not moves_before_grasp(task, steps)
 
 
 def completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple[PlanStep, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.resources import files
 
 import numpy as np
@@ -67,12 +67,26 @@ _TYPICAL = {
 
 def _coverage(task: Task, point: str, motion: str, steps: Sequence[tuple[Query, Verb]]) -> float:
     """Return the fraction of typical states in which at least one step is active and every active step is right."""
-    good = 0
+    good = [bool(active) and active <= right for active, right in _active(task, point, motion, steps)]
+    return sum(good) / len(good)
+
+
+def _active(
+    task: Task, point: str, motion: str, steps: Sequence[tuple[Query, Verb]]
+) -> Iterator[tuple[set[Verb], set[str]]]:
+    """Yield the verbs of the active steps and the right verbs in each typical state."""
     for offset, opening, lift, verbs in _TYPICAL[motion]:
         state = _state(task, point, offset, opening, lift)
-        active = {verb for query, verb in steps if _holds(query, task, state)}
-        good += bool(active) and active <= verbs
-    return good / len(_TYPICAL[motion])
+        yield {verb for query, verb in steps if _holds(query, task, state)}, verbs
+
+
+def moves_before_grasp(task: Task, steps: Sequence[PlanStep]) -> bool:
+    """Return whether a step that moves an object is active in a typical state in which the hand does not hold it."""
+    point = touched_point(task, [role_of(step) for step in steps])
+    moving: list[tuple[Query, Verb]] = [
+        (step.condition, "move") for step in steps if role_of(step).verb in ("carry", "move")
+    ]
+    return any(active for active, right in _active(task, point, "grasp", moving) if "move" not in right)
 
 
 def _state(task: Task, point: str, offset: Sequence[float], opening: float, lift: float) -> _Floats:

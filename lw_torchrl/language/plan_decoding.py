@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,9 +27,10 @@ from lw_torchrl.language.formats.prose import ProseReading
 from lw_torchrl.language.formats.python import PythonReading
 from lw_torchrl.language.formats.sentences import SentenceReading
 from lw_torchrl.language.formats.trees import TreeReading
+from lw_torchrl.language.library import expand
 from lw_torchrl.language.nearest import LIMIT, MappedQuery, StepMapper
 from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line, usual_goal
-from lw_torchrl.language.programs import Done, Node, ProgramError, compile_program, tidy
+from lw_torchrl.language.programs import Action, Block, Branch, Done, Node, ProgramError, compile_program, tidy
 from lw_torchrl.language.queries import MOST_CLAUSES, Query
 from lw_torchrl.language.skills import Skills, canonical_skill
 from lw_torchrl.language.step_parser import skill_effect
@@ -146,15 +147,34 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
     return DecodedPlan(written, scripted, reason, tuple(sorted(notes, key=lambda note: note.line)), tuple(steps))
 
 
-def decode_program(program: str | Node, task: Task) -> DecodedPlan:
-    """Decode a program in any format, or a tree of :mod:`lw_torchrl.language.programs`, like :func:`decode_plan`."""
+def decode_program(program: str | Node, task: Task, library: Mapping[str, str] | None = None) -> DecodedPlan:
+    """Decode a program in any format, or a tree of :mod:`lw_torchrl.language.programs`, like :func:`decode_plan`.
+
+    Args:
+        library: texts of programs that ``program`` calls by name; see :func:`~lw_torchrl.language.library.expand`.
+    """
+    mapper = StepMapper(task, None)
+
+    def tree(text: str) -> Node:
+        section = _read(text, mapper, None)[1]
+        if section.tree is not None:
+            return section.tree
+        return Block(
+            tuple(Branch(as_expression(c.condition), Action(c.skill, c.line, c.goal)) for c in section.clauses)
+        )
+
+    if library:
+        try:
+            program = expand(tree(program) if isinstance(program, str) else program, library, tree)
+        except (RecursionError, ProgramError) as error:
+            return DecodedPlan(None, None, str(error), (), ())
     if isinstance(program, str):
-        return decode_as(program, None, StepMapper(task, None))
+        return decode_as(program, None, mapper)
 
     def read(text: str) -> Reading:
         return Reading([Section("", 1, tree=program)])
 
-    return decode_as(" ", read, StepMapper(task, None))
+    return decode_as(" ", read, mapper)
 
 
 def _same(name: str, task: Task) -> bool:
