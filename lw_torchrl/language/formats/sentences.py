@@ -33,7 +33,7 @@ _OTHERWISE = re.compile(
     re.IGNORECASE,
 )
 _WHEN = re.compile(
-    r"(if|when|whenever|once|while|as long as|as soon as|after|unless|until|should)\s+(.+)", re.IGNORECASE
+    r"(if|when|whenever|once|while|as long as|as soon as|after|unless|until|should|with)\s+(.+)", re.IGNORECASE
 )
 _TRAILING = re.compile(r"([^:]+?),?\s(if|when|unless|as long as|whenever)\s(.+)", re.IGNORECASE)
 _ANSWER = re.compile(
@@ -70,6 +70,10 @@ _ACTED = re.compile(
     re.IGNORECASE,
 )
 _FILLER = re.compile(r"\s(?:already|still|yet|anymore|any more|now|either|also)\b(?! the)", re.IGNORECASE)
+_CASES = re.compile(
+    r"(?:either )?([^,]+), in which case (.+?)(?:,? or (?=.+, in which case)([^,]+), in which case (.+))?",
+    re.IGNORECASE,
+)
 _ENDS = re.compile(rf"(?:.*\b(?:and|then)\s)?(?:{'|'.join(PROGRAM_WORDS['prose']['ends'])})\b", re.IGNORECASE)
 _SENTENCES = re.compile(
     r"(?<=[.;!?])\s+|\s{2,}(?=\d{1,2}[.)]\s)|,\s+(?=(?:otherwise|or else|else)\b)"
@@ -204,6 +208,10 @@ class SentenceReading(Reading):
             chain, text = None, text[other.end() :] if other else text
         while lead := _LEAD.match(text):
             text = text[lead.end() :]
+        if cases := _CASES.fullmatch(text):
+            self.sentence(f"if {cases[1]}, {cases[2]}")
+            self.sentence(cases[3] and f"otherwise, if {cases[3]}, {cases[4]}")
+            return
         repeat = _REPEAT.match(text)
         if repeat and chain is None:
             condition = self.condition(repeat[3])
@@ -247,6 +255,8 @@ class SentenceReading(Reading):
             self.note(self.line, f"{shown(text)} is left out: it has no action")
         elif text.endswith(":") and _WHEN.match(text):
             self.conditional("if", text[:-1].split(" ", 1)[1], "", chain)
+        elif any(_is_imperative(part) for part in re.split(r",\s+", text)[1:]):
+            self.note(self.line, f"{shown(text)} is left out: its condition is not understood")
 
     def guarded(self, guard: Expression, text: str, continues: bool = False) -> None:
         """Add a sentence, or ask a question, under a condition."""
@@ -257,6 +267,7 @@ class SentenceReading(Reading):
         self.scopes[-1].append(_Choice([(guard, body)]))
         self.scopes.append(body)
         before, self.guard = self.guard, guard
+        text = text.partition(", so ")[2] or text  # "the way is free, so press the button"
         is_whole = _is_imperative(text) or _WHEN.match(text)
         self.sentence(f"if it is {text}" if continues else text if is_whole else f"if {text}")
         self.guard = before

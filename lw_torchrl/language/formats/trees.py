@@ -238,6 +238,10 @@ class _Tree:
             test = negate(condition) if _is_true(_get(row, "negate")) else condition
             body = self.node(children if then is None else then)
             otherwise = self.node(_get(row, "otherwise"))
+            if (
+                "if" in row and (then_elif := row.get("then elif")) is not None
+            ):  # "elif" and "then_elif" of the same object
+                otherwise = Branch(self.condition(row.get("elif")), self.node(then_elif) or Sequence(), otherwise)
             if body is None and otherwise is None:
                 return Check(test)
             if "while" in row or kind == "loop":
