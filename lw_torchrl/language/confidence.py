@@ -16,6 +16,7 @@ from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import STATES, comparisons
 from lw_torchrl.language.roles import BY_HAND, StepRole, Verb, motion_of
+from lw_torchrl.language.step_parser import is_obstacle
 from lw_torchrl.language.tasks import Task, first_object, is_goal, point_on, role_object
 
 
@@ -28,6 +29,7 @@ def role_of(step: PlanStep) -> StepRole:
 def touched_point(task: Task, roles: Sequence[StepRole]) -> str:
     """Return the point that the hand touches: the target of the first step other than "approach", else of any step."""
     hands = [role for role in roles if role.moved == GRIPPER != role.target and not is_goal(task, role.target)]
+    hands = [role for role in hands if not is_obstacle(role.target)] or hands
     hand = min(hands, key=lambda role: role.verb == "approach", default=None)
     name = first_object(task) if hand is None else hand.target
     assert name is not None
