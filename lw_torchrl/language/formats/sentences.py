@@ -112,7 +112,7 @@ class SentenceReading(Reading):
         self.questions = list[tuple[int, Expression, Expression]]()
         self.guard = TRUE  # the answers that the current sentence depends on
         indents = [0]
-        for number, line in enumerate(re.sub(r"[ \t]*→[ \t]*", ", ", text).splitlines(), 1):
+        for number, line in enumerate(re.sub(r"[ \t]*→[ \t]*", ": ", text).splitlines(), 1):
             self.line = number
             before, *cut = END.split("" if _NO_PROSE.match(line) or _HEADING.fullmatch(line) else line, maxsplit=1)
             item, self.indent = _ITEM.match(before), len(before) - len(before.lstrip())
@@ -268,8 +268,14 @@ class SentenceReading(Reading):
         self.scopes.append(body)
         before, self.guard = self.guard, guard
         text = text.partition(", so ")[2] or text  # "the way is free, so press the button"
-        is_whole = _is_imperative(text) or _WHEN.match(text)
-        self.sentence(f"if it is {text}" if continues else text if is_whole else f"if {text}")
+        if continues:
+            self.sentence(f"if it is {text}")
+        elif _is_imperative(text) or _WHEN.match(text):
+            self.sentence(text)
+        elif "," in text or text.endswith(":"):
+            self.sentence(f"if {text}")
+        else:
+            self.body(text, body)
         self.guard = before
         self.scopes.pop()
 

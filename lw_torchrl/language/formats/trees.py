@@ -40,6 +40,7 @@ _TYPES = {word: kind for kind, words in PROGRAM_WORDS["types"].items() for word 
 _MOST_VALUES = 20_000  # YAML's references can repeat a value
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|//[^\n]*|/\*.*?\*/|#[^\n]*|[^"\[\]{},/#]+|.', re.DOTALL)
 _YAML = re.compile(r"^\s*(?:- )?[\w -]{1,40}:(?:\s|$)", re.MULTILINE)
+_NUMBERED = re.compile(r"[a-z]+ \d+")
 _CODE = re.compile(r"^\s*(?:async )?(?:def|class) \w", re.MULTILINE)
 
 
@@ -218,6 +219,8 @@ class _Tree:
             return Selector(parts) if kind == "selector" else Sequence(parts, memory)
         if kind == "condition":
             return Check(self.condition(row))
+        if any(_NUMBERED.fullmatch(key) and key.split(" ")[0] in _TYPES for key in row):
+            return Sequence(tuple(self.typed(row)))
         if kind == "action" or (kind is None and condition is None and isinstance(then, str)):
             return self.until(self.action(row), row)
         for role in ("rules", "sequence", "remembered"):
@@ -277,7 +280,7 @@ class _Tree:
         """Return the parts of an object whose keys begin with a type: {"condition 1": ..., "sequence push": ...}."""
         parts = list[Node]()
         kinds = [(key.split(" ")[0].rstrip("0123456789"), each) for key, each in row.items()]
-        if sum(word in _TYPES for word, _ in kinds) < 2:
+        if sum(word in _TYPES for word, _ in kinds) < 2 and not any(map(_NUMBERED.fullmatch, row)):
             return []
         for word, each in kinds:
             kind = _TYPES.get(word)
