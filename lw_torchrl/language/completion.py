@@ -71,11 +71,13 @@ def completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple[
             motion = replace(motion, moved=moved)
         if motion.verb == "move" and steps and any(map(is_obstacle, task.object_names)):
             motion = replace(motion, verb="carry")
-        held = Query((*near.clauses, *gripper_is("closed").clauses))
+        # Around a wide object fingers are never closed. A layout with its own threshold knows its objects.
+        opened = gripper_is("open" if "open" in task.layout.thresholds else "wide open")
+        held = Query((*near.clauses, *negated(opened).clauses))
         return (
             by_hand("approach", "grasp", negated(above), away),
             by_hand("descend", "grasp", above, away),
-            by_hand("close", "grasp", near, gripper_is("open")),
+            by_hand("close", "grasp", near, opened),
             *(_own_motions(task, steps, held) or [step_of(held, motion)]),
         )
     way, motion = motion.direction, replace(motion, target=point)

@@ -191,7 +191,8 @@ _GROUPS: tuple[tuple[Callable[[str], Reading], ...], ...] = (
 _CONTROL_WORDS = re.compile(r"\b(?:otherwise|or else|else,|unless)\b|\bgo (?:on |back )?to step\b", re.IGNORECASE)
 # The published formats have none of these: questions, and conditions behind an action.
 _FREE_WORDS = re.compile(
-    r"\?|\bif (?:so|not|it isn't)\b|^[ \t]*(?:\W+|\d+[.)] )?(?!when|if|once|while|as |the task)\w[^.\n]* (?:if|until|when) ",
+    r"\?|\bif (?:so|not|it isn't)\b"
+    r"|^[ \t]*(?:\W+|\d+[.)] )?(?!when|if|once|while|as |the task)\w[^.\n]* (?:if|until|when) ",
     re.IGNORECASE | re.MULTILINE,
 )
 

@@ -89,7 +89,7 @@ class EvaluatorAnchor:
     def __call__(self, batch: TensorDictBase) -> Tensor:
         """Return the loss () float32 of a batch with ``observation``, ``task_id`` and the evaluator's input keys.
 
-        Plans with conditions on earlier steps ("once ...") also need ``qaf_latches``, from a QAFTransform in the buffer.
+        Plans with conditions on earlier steps ("once ...") also need ``qaf_latches``, from the buffer's QAFTransform.
         """
         observation, task = batch.get("observation"), batch.get("task_id")
         logits = self.evaluator.logits_of(batch)

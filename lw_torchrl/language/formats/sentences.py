@@ -28,8 +28,8 @@ _CATCH_ALL = (
     r"in (?:all|any|every) other (?:cases?|situations?)|anything else|(?:none|neither) of (?:the )?(?:above|these)"
 )
 _OTHERWISE = re.compile(
-    rf"(?:otherwise|or else|else|failing that|(?:if|when) (?:not|it is not|it isn't|neither holds|we don't)(?=,)|if not|"
-    rf"{_CATCH_ALL})(?:\b|(?<=\?))(?:[,:.?]| →)*\s*",
+    r"(?:otherwise|or else|else|failing that|(?:if|when) (?:not|it is not|it isn't|neither holds|we don't)(?=,)"
+    rf"|if not|{_CATCH_ALL})(?:\b|(?<=\?))(?:[,:.?]| →)*\s*",
     re.IGNORECASE,
 )
 _WHEN = re.compile(
