@@ -127,10 +127,10 @@ class _Module:
         }
         # The constants of the module and its classes; a method's ``self.SIDE`` is the constant SIDE.
         self.constants = _Scope(self, {})
-        for owner in (module, *(node for node in module.body if isinstance(node, ast.ClassDef))):
-            for node in owner.body:
-                if isinstance(node, ast.Assign | ast.AnnAssign) and not isinstance(node.value, ast.Call | None):
-                    self.constants.statement(node)
+        classes = [node.body for node in module.body if isinstance(node, ast.ClassDef)]
+        for node in (node for body in (module.body, *classes) for node in body):
+            if isinstance(node, ast.Assign | ast.AnnAssign) and not isinstance(node.value, ast.Call | None):
+                self.constants.statement(node)
         outside = [node for node in module.body if not isinstance(node, _Function | ast.ClassDef)]
         self.section("", 1, outside, {name for name in self.functions if name not in called})
         for name, function in self.functions.items():
@@ -448,8 +448,8 @@ class _Scope:
             case ast.Name(id=name):
                 known = self.values.get(name)
                 return known if isinstance(known, str | _Choice) else None
-            case ast.Attribute() | ast.Subscript() if (value := self.entry(node)) is not None:
-                return self.text(value)
+            case ast.Attribute() | ast.Subscript() if (entry := self.entry(node)) is not None:
+                return self.text(entry)
             case ast.Subscript(value=value, slice=key) if (table := self.table(value)) is not None:
                 return self.text_at(table, self.value(key))
             case ast.Call(func=ast.Attribute(value=value, attr="get"), args=[key, *_]) if table := self.table(value):
@@ -494,13 +494,14 @@ class _Scope:
             ):
                 pair = [text for each in call.args if (text := self.argument(each)) is not None]
                 near = _leaf(_joined([*pair[:1], "near", *pair[1:]]))
+                self.note(node, f"the threshold in {shown(ast.unparse(node))} is read as that of 'near'")
                 return near if isinstance(op, ast.Lt | ast.LtE) else negate(near)
             case ast.Compare(left=ast.Name(id=name), ops=[op], comparators=[right]) if (
                 isinstance(known := self.values.get(name), str | _Choice)
                 and (isinstance(known, _Choice) or ast.unparse(right) == "None")
-                and isinstance(text := self.value(right), str)
+                and isinstance(other := self.value(right), str)
             ):
-                equal = _equals(known, text)
+                equal = _equals(known, other)
                 return negate(equal) if isinstance(op, ast.NotEq | ast.IsNot) else equal
             case ast.Compare(left=left, ops=[ast.Is() | ast.Eq() | ast.NotEq() as op], comparators=[right]):
                 words = [self.argument(left), "is", self.argument(right)]
@@ -511,12 +512,12 @@ class _Scope:
                 return (any_of if name == "any" else all_of)(self.parts(argument))
             case ast.Call(func=ast.Name(id="bool"), args=[argument]):
                 return self.condition(argument)
-            case ast.Attribute() | ast.Subscript() if (value := self.entry(node)) is not None:
-                return self.condition(value)
-            case ast.Call(func=function, args=args) if isinstance(known := self.entry(function), ast.Lambda):
-                names = [each.arg for each in known.args.args]
+            case ast.Attribute() | ast.Subscript() if (entry := self.entry(node)) is not None:
+                return self.condition(entry)
+            case ast.Call(func=function, args=args) if isinstance(called := self.entry(function), ast.Lambda):
+                names = [each.arg for each in called.args.args]
                 inner = {key: self.value(each) for key, each in zip(names, args, strict=False)}
-                return _Scope(self.module, self.values | inner).condition(known.body) if self.count(1) else FALSE
+                return _Scope(self.module, self.values | inner).condition(called.body) if self.count(1) else FALSE
             case ast.Call() if name := self.module.helper(node):
                 return _truth(self.called(node, name))
             case ast.Call() if (text := self.question(node)) is not None:

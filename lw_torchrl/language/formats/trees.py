@@ -257,8 +257,8 @@ class _Tree:
             return None if body is None else self.until(body, row)
         if (otherwise := _get(row, "otherwise")) is not None:
             return self.node(otherwise)
-        if parts := self.typed(row):
-            return parts[0] if len(parts) == 1 else Sequence(tuple(parts))
+        if typed := self.typed(row):
+            return typed[0] if len(typed) == 1 else Sequence(tuple(typed))
         values = [each for each in row.values() if isinstance(each, dict | list)]
         if values:  # names, with programs
             return self.node(values[0] if len(values) == 1 else values)
