@@ -214,7 +214,7 @@ def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) 
             if group[1] is SentenceReading and all(clause.condition in (TRUE, FALSE) for clause in other[1].clauses):
                 other = first  # prose without any condition is not a plan
             empty.append(other)
-            known = mapper if ProseReading in group else None
+            known = mapper if is_free else None
             best = max(
                 first,
                 other,

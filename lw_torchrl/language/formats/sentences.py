@@ -223,7 +223,8 @@ class SentenceReading(Reading):
             return
         head, colon, rest = text.partition(": ")
         if colon and not _WHEN.match(text):
-            if _RELATION.search(head) and not is_verb(head.split()):
+            is_case = _RELATION.search(head) and len(head.split()) > 2 and not is_verb(head.split())
+            if is_case and (_is_imperative(rest) or _WHEN.match(rest)):
                 self.conditional("if", head, rest, chain)
                 return
             if _WHEN.match(rest):

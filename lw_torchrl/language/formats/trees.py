@@ -180,7 +180,7 @@ class _Tree:
                 rest = value[1] if kind in ("condition", "action") and len(value) == 2 else value[1:]
                 return self.object({"type": kind, "text" if isinstance(rest, str) else "children": rest})
             pairs = [each for each in value if isinstance(each, list) and len(each) == 2]
-            if pairs == value and all(isinstance(test, str) and not _TYPES.get(test.lower()) for test, _ in pairs):
+            if pairs == value and all(isinstance(test, str) and is_verb(str(then).split()) for test, then in pairs):
                 value = [{"if": test, "then": then} for test, then in pairs]
             nodes = self.children(value)
             rules = is_rule_list or any(isinstance(each, Branch) for each in nodes)
@@ -260,7 +260,7 @@ class _Tree:
         if typed := self.typed(row):
             return typed[0] if len(typed) == 1 else Sequence(tuple(typed))
         values = [each for each in row.values() if isinstance(each, dict | list)]
-        if values:  # names, with programs
+        if len(values) == 1 or (values and all(key.isdigit() for key in row)):  # a name or numbers, with programs
             return self.node(values[0] if len(values) == 1 else values)
         if any(isinstance(each, str) for key, each in row.items() if key not in _KEYS["comment"] + _KEYS["name"]):
             self.reading.note(
