@@ -1,8 +1,12 @@
-"""python -m benchmarks.programs FILE: how many actions of programs decode_plan keeps.
+"""python -m benchmarks.programs [FILE ...]: how many actions of programs decode_plan keeps.
 
-FILE is JSON: {style: {task: text}}. The actions of a text are counted without the readers under test: in Python the
-calls of ``robot``, in JSON the texts that are not conditions or names, in prose the imperatives. An action is kept if a
-step of the plan has its words; a lost one is named if a note quotes its words.
+A file is JSON: {style: {task: text}}, or {style: {task: [{"text": ..., "actions": [...]}, ...]}} with the actions that
+the writer of the text listed. Otherwise the actions are counted without the readers under test: in Python the calls of
+``robot``, in JSON the texts that are not conditions or names, in prose the imperatives. An action is kept if a step of
+the plan has its words; a lost one is named if a note quotes its words.
+
+data/blind_programs.json holds 120 programs, written from the development tasks and the query language alone. Before
+their losses were read, 0.602, 0.588 and 0.549 of their actions were kept; since then they are development data.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ import tyro
 
 import lw_torchrl as lw
 
+BLIND = Path(__file__).parent / "data" / "blind_programs.json"
 _NO_ACTION = {
     "if", "when", "while", "until", "condition", "check", "name", "type", "next", "to", "initial", "start",
     "all", "any", "and", "or", "not",
@@ -69,33 +74,43 @@ def _overlap(action: str, other: str) -> bool:
     return first[:1] == second[:1] and shared >= min(len({*first}), len({*second})) - 1
 
 
-def main(file: tyro.conf.Positional[Path], show: bool = False) -> None:
-    for style, programs in json.loads(file.read_text("utf-8")).items():
-        total = kept = named = plans = 0
-        for task, text in programs.items():
-            decoded = lw.decode_plan(text, task)
-            left = [step.written_skill for step in decoded.steps if not step.dropped]
-            plans += decoded.plan is not None
-            for action in actions_in(text):
-                total += 1
-                match = next((skill for skill in left if _overlap(action, skill)), None)
-                if match is not None:
-                    left.remove(match)
-                    kept += 1
-                else:
-                    is_named = any(
-                        _overlap(action, words)
-                        for note in decoded.notes
-                        for words in re.findall(r"'([^']*)'", str(note))
-                    )
-                    named += is_named
-                    print(f"  {task}: lost {action!r}, {'named' if is_named else 'not named'} in the notes")
-            if show:
-                print(decoded.plan, *decoded.notes, sep="\n")
-        print(
-            f"{style}: {plans} of {len(programs)} plans, {kept} of {total} actions kept ({kept / total:.3f}), "
-            f"{named} of {total - kept} lost ones named in the notes"
-        )
+def _texts(entry: Any) -> list[tuple[str, list[str]]]:
+    """Return the (text, actions) pairs of a task."""
+    if isinstance(entry, str):
+        return [(entry, actions_in(entry))]
+    return [(each["text"], [_words(action) for action in each["actions"]]) for each in entry]
+
+
+def main(files: tyro.conf.Positional[tuple[Path, ...]] = (BLIND,), show: bool = False) -> None:
+    for file in files:
+        for style, programs in json.loads(file.read_text("utf-8")).items():
+            _measure(style, [(task, *pair) for task, entry in programs.items() for pair in _texts(entry)], show)
+
+
+def _measure(style: str, programs: list[tuple[str, str, list[str]]], show: bool) -> None:
+    total = kept = named = plans = 0
+    for task, text, actions in programs:
+        decoded = lw.decode_plan(text, task)
+        left = [step.written_skill for step in decoded.steps if not step.dropped]
+        plans += decoded.plan is not None
+        for action in actions:
+            total += 1
+            match = next((skill for skill in left if _overlap(action, skill)), None)
+            if match is not None:
+                left.remove(match)
+                kept += 1
+            else:
+                is_named = any(
+                    _overlap(action, words) for note in decoded.notes for words in re.findall(r"'([^']*)'", str(note))
+                )
+                named += is_named
+                print(f"  {task}: lost {action!r}, {'named' if is_named else 'not named'} in the notes")
+        if show:
+            print(decoded.plan, *decoded.notes, sep="\n")
+    print(
+        f"{style}: {plans} of {len(programs)} plans, {kept} of {total} actions kept ({kept / total:.3f}), "
+        f"{named} of {total - kept} lost ones named in the notes"
+    )
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 from lw_torchrl.language.expressions import Expression, all_of, any_of, negate, once
@@ -47,6 +47,36 @@ class _Group:
         condition = all_of([first, *map(negate, others)])
         condition = negate(condition) if self.negated_inside else condition
         return once(condition) if self.is_latch else condition
+
+
+_PARTNERS = {"neither": "nor", "either": "or", "both": "and"}
+
+
+def repeat_predicate(words: Sequence[str], relations: Collection[str]) -> list[str]:
+    """Repeat a predicate that two subjects share, so that each operand is a clause.
+
+    Args:
+        relations: the words that a predicate begins with.
+
+    Example:
+        >>> " ".join(repeat_predicate("neither a nor b is near c".split(), {"is", "near"}))
+        'neither a is near c nor b is near c'
+    """
+    words = list(words)
+    for start, word in enumerate(words):
+        if (partner := _PARTNERS.get(word)) is None or partner not in words[start:]:
+            continue
+        middle = words.index(partner, start)
+        stops = {*relations, *CONNECTIVES, "(", ")"}
+        verb = next((number for number in range(middle + 1, len(words)) if words[number] in stops), None)
+        if verb is None or verb == middle + 1 or words[verb] not in relations or stops & {*words[start + 1 : middle]}:
+            continue
+        end = next((number for number in range(verb, len(words)) if words[number] in (*CONNECTIVES, ")")), len(words))
+        predicate = ["is" if each == "are" else each for each in words[verb:end]]
+        words[verb:end] = predicate
+        words[middle:middle] = predicate
+        return repeat_predicate(words, relations)
+    return words
 
 
 # The groups that a word ends; a parenthesis and the end of the text end all but "(".

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 from lw_torchrl._util.checks import check_choice, counted, shown, typed
-from lw_torchrl.language.expressions import FALSE, TRUE, Expression, count_mentions, leaves, replace_leaves
+from lw_torchrl.language.expressions import (
+    FALSE,
+    TRUE,
+    Expression,
+    all_of,
+    as_expression,
+    count_mentions,
+    leaves,
+    negate,
+    replace_leaves,
+)
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, listed_steps
 from lw_torchrl.language.formats.code import CodeReading
@@ -17,9 +27,10 @@ from lw_torchrl.language.formats.prose import ProseReading
 from lw_torchrl.language.formats.python import PythonReading
 from lw_torchrl.language.formats.sentences import SentenceReading
 from lw_torchrl.language.formats.trees import TreeReading
+from lw_torchrl.language.library import expand
 from lw_torchrl.language.nearest import LIMIT, MappedQuery, StepMapper
 from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line, usual_goal
-from lw_torchrl.language.programs import Done, Node, ProgramError, compile_program, tidy
+from lw_torchrl.language.programs import Action, Block, Branch, Done, Node, ProgramError, compile_program, tidy
 from lw_torchrl.language.queries import MOST_CLAUSES, Query
 from lw_torchrl.language.skills import Skills, canonical_skill
 from lw_torchrl.language.step_parser import skill_effect
@@ -64,6 +75,7 @@ class DecodedPlan:
         return self.plan is not None and self.scripted is not None and len(self.scripted.steps) == len(self.plan.steps)
 
 
+_MOST_COMPARED = 16  # maximum number of conditions in a guard that is compared with an effect
 _LONGEST = 65_536  # maximum number of characters to parse
 
 
@@ -135,15 +147,34 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
     return DecodedPlan(written, scripted, reason, tuple(sorted(notes, key=lambda note: note.line)), tuple(steps))
 
 
-def decode_program(program: str | Node, task: Task) -> DecodedPlan:
-    """Decode a program in any format, or a tree of :mod:`lw_torchrl.language.programs`, like :func:`decode_plan`."""
+def decode_program(program: str | Node, task: Task, library: Mapping[str, str] | None = None) -> DecodedPlan:
+    """Decode a program in any format, or a tree of :mod:`lw_torchrl.language.programs`, like :func:`decode_plan`.
+
+    Args:
+        library: texts of programs that ``program`` calls by name; see :func:`~lw_torchrl.language.library.expand`.
+    """
+    mapper = StepMapper(task, None)
+
+    def tree(text: str) -> Node:
+        section = _read(text, mapper, None)[1]
+        if section.tree is not None:
+            return section.tree
+        return Block(
+            tuple(Branch(as_expression(c.condition), Action(c.skill, c.line, c.goal)) for c in section.clauses)
+        )
+
+    if library:
+        try:
+            program = expand(tree(program) if isinstance(program, str) else program, library, tree)
+        except (RecursionError, ProgramError) as error:
+            return DecodedPlan(None, None, str(error), (), ())
     if isinstance(program, str):
-        return decode_as(program, None, StepMapper(task, None))
+        return decode_as(program, None, mapper)
 
     def read(text: str) -> Reading:
         return Reading([Section("", 1, tree=program)])
 
-    return decode_as(" ", read, StepMapper(task, None))
+    return decode_as(" ", read, mapper)
 
 
 def _same(name: str, task: Task) -> bool:
@@ -158,6 +189,12 @@ _GROUPS: tuple[tuple[Callable[[str], Reading], ...], ...] = (
     (ProseReading, SentenceReading),
 )
 _CONTROL_WORDS = re.compile(r"\b(?:otherwise|or else|else,|unless)\b|\bgo (?:on |back )?to step\b", re.IGNORECASE)
+# The published formats have none of these: questions, and conditions behind an action.
+_FREE_WORDS = re.compile(
+    r"\?|\bif (?:so|not|it isn't)\b"
+    r"|^[ \t]*(?:\W+|\d+[.)] )?(?!when|if|once|while|as |the task)\w[^.\n]* (?:if|until|when) ",
+    re.IGNORECASE | re.MULTILINE,
+)
 
 
 def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) -> tuple[Reading, Section]:
@@ -171,13 +208,17 @@ def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) 
         best = first = _with_clauses(group[0], text, mapper)
         empty.append(first)
         own = _own_lines(text, first[0], mapper.task) if ProseReading in group else text
-        if len(group) > 1 and _has_control(*first, own):
-            other = _with_clauses(group[1], own, mapper)
+        is_free = read is None and ProseReading in group and _FREE_WORDS.search(own) is not None
+        if len(group) > 1 and (is_free or _has_control(*first, own)):
+            other = _with_clauses(group[1], own, mapper, any_name=read is None)
             if group[1] is SentenceReading and all(clause.condition in (TRUE, FALSE) for clause in other[1].clauses):
                 other = first  # prose without any condition is not a plan
             empty.append(other)
+            known = mapper if is_free else None
             best = max(
-                first, other, key=lambda pair: (_kept(pair[1]), -len(_section_notes(pair[0], pair[1], mapper.task)))
+                first,
+                other,
+                key=lambda pair: (_kept(pair[1], known), -len(_section_notes(pair[0], pair[1], mapper.task))),
             )
         if best[1].clauses:
             if number and read is not None:
@@ -186,8 +227,13 @@ def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) 
     return next((pair for pair in empty if pair[0].error), empty[0])
 
 
-def _with_clauses(read: Callable[[str], Reading], text: str, mapper: StepMapper) -> tuple[Reading, Section]:
-    """Parse a text, compile the programs for the task; return the result and its section with the most clauses."""
+def _with_clauses(
+    read: Callable[[str], Reading], text: str, mapper: StepMapper, any_name: bool = False
+) -> tuple[Reading, Section]:
+    """Parse a text, compile the programs for the task; return the result and its section with the most clauses.
+
+    With ``any_name``, a function whose name is not a task's is a plan for the task if the text has no other.
+    """
 
     def effect(skill: str) -> str | None:
         goal = mapper.query(skill.partition(" until ")[2]) if " until " in skill else None
@@ -199,15 +245,31 @@ def _with_clauses(read: Callable[[str], Reading], text: str, mapper: StepMapper)
             return None if query is None else str(query)
         return None
 
+    def is_done(guard: Expression, effect: str) -> bool:
+        if len(leaves(guard)) > _MOST_COMPARED:
+            return False
+        mapped = replace_leaves(guard, lambda leaf: _expression(mapper, leaf))
+        return all_of([mapped, negate(_expression(mapper, effect))]) == FALSE
+
     try:
         reading = read(text)
     except (RecursionError, ProgramError) as error:
         reading = Reading(error=str(error) if isinstance(error, ProgramError) else "the text nests too deeply")
     own = [section for section in reading.sections if not section.task or _same(section.task, mapper.task)]
+    if any_name and not any(section.clauses or section.tree for section in own):
+        own = [
+            each
+            for each in reading.sections
+            if each.tree and not any(_same(each.task, task) for task in TASKS.values())
+        ]
+        for section in own:
+            reading.note(section.line, f"the function {shown(section.task)} is read as a plan for {mapper.task.name}")
     for section in own:
         if section.tree is not None:
             try:
-                steps = compile_program(section.tree, effect, lambda text: mapper.query(text).query is not None)
+                steps = compile_program(
+                    section.tree, effect, lambda text: mapper.query(text).query is not None, is_done
+                )
             except ProgramError as error:
                 reading.error = str(error)
                 continue
@@ -217,9 +279,18 @@ def _with_clauses(read: Callable[[str], Reading], text: str, mapper: StepMapper)
     return reading, max(own or [Section("", 1)], key=_kept)
 
 
-def _kept(section: Section) -> int:
-    """Return how many clauses of a section can be active."""
-    return sum(clause.condition != FALSE for clause in section.clauses)
+def _expression(mapper: StepMapper, leaf: Any) -> Expression:
+    query = mapper.query(leaf).query if isinstance(leaf, str) else None
+    return as_expression(str(leaf)) if query is None else query.expression
+
+
+def _kept(section: Section, mapper: StepMapper | None = None) -> int:
+    """Return how many clauses of a section can be active; with a mapper, unknown conditions are never true."""
+    conditions = [clause.condition for clause in section.clauses]
+    return sum(
+        each != FALSE and not (mapper and isinstance(each, str) and mapper.query(each).query is None)
+        for each in conditions
+    )
 
 
 def _has_control(reading: Reading, section: Section, text: str) -> bool:
@@ -312,14 +383,15 @@ def _mapped_guard(clause: Clause, mapper: StepMapper, notes: list[Note]) -> tupl
         if isinstance(leaf, Done):
             effect = skill_effect(leaf.text, mapper.task)
             return FALSE if effect is None else effect.expression
-        is_new = leaf not in mapper.mapped
         mapped, distance, exact = mapper.query(leaf)
         distances.append(distance)
         if mapped is None:
             unknown.append(leaf)
-        if is_new and not exact:
+        if not exact:
             how = "counts as never true" if mapped is None else f"is read as {str(mapped)!r}"
-            notes.append(Note(clause.line, f"the condition {shown(leaf)} {how} (distance {distance:.2f})"))
+            text = f"the condition {shown(leaf)} {how} (distance {distance:.2f})"
+            if all(note.text != text for note in notes):
+                notes.append(Note(clause.line, text))
         return FALSE if mapped is None else mapped.expression
 
     if len(leaves(guard)) > MOST_CLAUSES:

@@ -132,7 +132,9 @@ class ConditionalPlan:
         return cls(definition.name, steps, definition)
 
     @classmethod
-    def from_program(cls, program: str | Node, task: str | Task) -> ConditionalPlan:
+    def from_program(
+        cls, program: str | Node, task: str | Task, library: Mapping[str, str] | None = None
+    ) -> ConditionalPlan:
         """Build a plan from a program with control flow; the text is parsed, never executed.
 
         Each action becomes a step whose condition is that of its path, as :func:`~lw_torchrl.decode_plan` describes.
@@ -140,9 +142,12 @@ class ConditionalPlan:
 
         Args:
             program: Python, JSON, YAML or prose; or a tree of :mod:`lw_torchrl.language.programs`.
+            library: programs that ``program`` may call by name, such as {"grasp {object}": text}, for example
+                :data:`lw_torchrl.language.library.LIBRARY`; None for none.
 
         Raises:
-            PlanError: the program has no action for the task that can be read, or it nests too deeply.
+            PlanError: the program has no action for the task that can be read, it nests too deeply, or a program of the
+                library calls itself.
 
         Example:
             >>> program = '''
@@ -162,7 +167,7 @@ class ConditionalPlan:
         """
         from lw_torchrl.language.plan_decoding import decode_program  # here, because it imports this module
 
-        decoded = decode_program(program, get_task(task))
+        decoded = decode_program(program, get_task(task), library)
         if decoded.plan is None:
             raise PlanError("; ".join([decoded.reason, *(str(note) for note in decoded.notes[:3])]))
         return decoded.plan

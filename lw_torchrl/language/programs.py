@@ -126,6 +126,7 @@ def compile_program(
     program: Node,
     effect: Callable[[str], str | None] = lambda text: None,
     known: Callable[[str], bool] = lambda text: True,
+    is_done: Callable[[Expression, str], bool] = lambda guard, effect: False,
 ) -> list[Guarded]:
     """Compile a program into guarded actions, for a policy that evaluates all guards at each control step.
 
@@ -135,6 +136,7 @@ def compile_program(
     Args:
         effect: returns the condition that an action makes true ("the gripper is open"), or None if it has no name.
         known: returns whether a condition can be evaluated; a loop with an unknown condition runs always.
+        is_done: returns whether a guard implies an effect, which then cannot be the effect of the guarded action.
 
     Raises:
         ProgramError: the program nests more than 60 programs, or a condition joins more than 1,000 others.
@@ -146,7 +148,7 @@ def compile_program(
         near or held -> close the gripper
         not near and not held -> move to the puck
     """
-    compiler = _Compiler(effect, known)
+    compiler = _Compiler(effect, known, is_done)
     try:
         compiler.run(program, TRUE, False, 0)
     except ProgramError:
@@ -208,8 +210,13 @@ def tidy(guard: Expression) -> Expression:
 
 
 class _Compiler:
-    def __init__(self, effect: Callable[[str], str | None], known: Callable[[str], bool]) -> None:
-        self.effect, self.known, self.steps = effect, known, list[Guarded]()
+    def __init__(
+        self,
+        effect: Callable[[str], str | None],
+        known: Callable[[str], bool],
+        is_done: Callable[[Expression, str], bool],
+    ) -> None:
+        self.effect, self.known, self.is_done, self.steps = effect, known, is_done, list[Guarded]()
 
     def run(self, node: Node, here: Expression, followed: bool, depth: int) -> _Flow:
         """Append the guarded actions of a program with the guard ``here``.
@@ -238,6 +245,8 @@ class _Compiler:
 
     def action(self, node: Action, here: Expression, followed: bool) -> _Flow:
         effect = self.effect(node.text)
+        if effect is not None and followed and self.is_done(here, effect):
+            effect = None
         done = TRUE if effect is None else all_of([effect])
         guard = all_of([here, negate(done)]) if followed and effect is not None else here
         self.steps.append(Guarded(guard, node))

@@ -12,7 +12,7 @@ from itertools import permutations
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._util.checks import typed
-from lw_torchrl.language.connectives import CONNECTIVES, OPENERS, parse_words
+from lw_torchrl.language.connectives import CONNECTIVES, OPENERS, parse_words, repeat_predicate
 from lw_torchrl.language.expressions import (
     FALSE,
     TRUE,
@@ -37,6 +37,9 @@ from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, STATES, TOUCHING, UNARY
 from lw_torchrl.language.tasks import Task, get_task
 
+_BEGINNINGS = {"is", "are", "isn't", "aren't", "not"} | {
+    predicate.split()[0] for predicate in PREDICATES
+}  # of predicates
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
 _OTHERS = frozenset(("(", *CONNECTIVES)) - {"and"}
@@ -364,7 +367,7 @@ def read_query(text: str, task: Task) -> Query | None:
 
 
 def _parse(text: str, task: Task, explain: bool) -> Query:
-    words = split_words(text.replace("’", "'").casefold().strip().strip(" ?.!"))
+    words = repeat_predicate(split_words(text.replace("’", "'").casefold().strip().strip(" ?.!")), _BEGINNINGS)
     clauses: list[Clause] = []
 
     def operand_of(operand: list[str]) -> Expression:

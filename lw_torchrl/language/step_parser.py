@@ -25,6 +25,7 @@ _IDLE = re.compile(
     r"(?:stop|wait|pause|finish|done|stay|rest|idle|hold|pass|return|success|(?:do|keep|hold|be) (?:nothing|still))"
     r"(?: (?:here|still|moving|there|now|put))*"
 )
+_OBSTACLES = frozenset(WORDS["canonical"]["obstacles"])
 _TOOL = re.compile(r"(?<!line )(?<!level )(?<!aligned )\bwith <([^>]*)>")
 
 
@@ -83,7 +84,7 @@ def is_free(step: PlanStep) -> bool:
 
 def is_obstacle(name: str) -> bool:
     """Return whether an object is named as something to move over or around."""
-    return "wall" in name.split()
+    return not _OBSTACLES.isdisjoint(name.split())
 
 
 def parse_steps(plan: ConditionalPlan) -> tuple[ParsedStep | None, ...]:

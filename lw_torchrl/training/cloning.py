@@ -87,10 +87,13 @@ class EvaluatorAnchor:
         self.steps = TaskTables(tables.index, _Steps(tables.mask), f"tasks without a plan in {plans!r}")
 
     def __call__(self, batch: TensorDictBase) -> Tensor:
-        """Return the loss () float32 of a batch with ``observation``, ``task_id`` and the evaluator's input keys."""
+        """Return the loss () float32 of a batch with ``observation``, ``task_id`` and the evaluator's input keys.
+
+        Plans with conditions on earlier steps ("once ...") also need ``qaf_latches``, from the buffer's QAFTransform.
+        """
         observation, task = batch.get("observation"), batch.get("task_id")
         logits = self.evaluator.logits_of(batch)
-        truth = self.program(observation, task).to(logits.dtype)
+        truth = self.program(observation, task, batch.get("qaf_latches", None)).to(logits.dtype)
         mask = self.steps.select(task, observation).mask.to(logits.dtype)
         errors = nn.functional.binary_cross_entropy_with_logits(logits, truth, reduction="none")
         return (errors * mask).sum() / mask.sum()

@@ -69,6 +69,14 @@ def latches_of_rows(program: QueryProgram, observation: Tensor, task_id: Tensor,
     return latches
 
 
+def truth_of_episode(plans: Plans, steps: TensorDictBase) -> Tensor:
+    """Return the truth (T, S) bool of the plans' conditions in the steps (T,) of one episode, with its latches."""
+    program, observation, task_id = plan_program(plans), steps.get("observation"), steps.get("task_id")
+    if not program.num_latches:
+        return program(observation, task_id)
+    return program(observation, task_id, latches_of_rows(program, observation, task_id, torch.zeros_like(task_id)))
+
+
 class QAFTransform(KeepsEnvState):
     """A transform that answers the conditions of each row's plan, in an environment or on a replay buffer.
 

@@ -426,3 +426,12 @@ def test_the_repaired_episode_is_kept_and_can_be_simulated_again():
     shown = [mended.steps[key].numpy() for key in ("action", "observation")]
     assert simulate_again(TASK, SEED, 0, *shown) is not None, "bit for bit"
     assert "mended" not in failure.to_json()
+
+
+def test_plans_with_memory_are_diagnosed():
+    first = str(PLANS[TASK].steps[0].condition)
+    pairs = [(f"not once ({first})", PLANS[TASK].steps[0].skill), (f"once ({first})", PLANS[TASK].steps[0].skill)]
+    result = evaluated(lw.ScriptedSkillActor(lw.Plans([lw.ConditionalPlan.from_pairs(TASK, pairs)])))
+    (failure,) = result.failures
+    assert failure.evidence["answers_wrong"] == 0.0  # the latches are those of the episode
+    assert failure.evidence["no_condition_late"] == 0.0

@@ -323,3 +323,16 @@ def test_broken_json_is_refused(change, message):
         change = {"roles": [row["roles"][0] | roles, *row["roles"][1:]]}
     with pytest.raises(PlanError, match=message):
         ConditionalPlan.from_json("dial-turn", row | change)
+
+
+def test_a_plan_in_order_of_priority_keeps_its_steps():
+    rules = [
+        ("gripper near puck and gripper closed", "carry the puck to the target location"),
+        ("gripper near puck and gripper open", "close the gripper around the puck"),
+        ("gripper above puck and gripper not near puck", "lower the gripper around the puck"),
+        ("gripper not above puck and gripper not near puck", "place the gripper above the puck"),
+    ]
+    for pairs in (rules, rules[::-1]):
+        assert explain_canonical(lw.ConditionalPlan.from_pairs("pick-place", pairs)).source == "plan"
+    rules[0] = ("gripper above puck or gripper near puck and gripper closed", rules[0][1])  # also before the grasp
+    assert explain_canonical(lw.ConditionalPlan.from_pairs("pick-place", rules)).source == "completed"

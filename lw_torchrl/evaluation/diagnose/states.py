@@ -20,7 +20,7 @@ from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import draws, plans_of
-from lw_torchrl.transforms.qaf import plan_program
+from lw_torchrl.transforms.qaf import truth_of_episode
 
 _OFTEN, _BRIEF = 0.4, 5  # "often": more than this fraction of a plan step's states; with fewer than 5, undecided
 _SAME = 0.02  # actions that differ from the script's by less than this count as equal
@@ -164,7 +164,7 @@ def chosen(truth: Tensor, steps: int) -> Tensor:
 def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, answers: Tensor | None) -> EpisodeStates:
     """Return an episode's states under the policy's plan; ``answers`` are used if no ``qaf_logits`` were recorded."""
     number = len(plans[task].steps)
-    truth = plan_program(Plans([plans[task]]))(steps.get("observation"), steps.get("task_id"))[:, :number]
+    truth = truth_of_episode(Plans([plans[task]]), steps)[:, :number]
     if (logits := steps.get("qaf_logits", None)) is not None:
         answers = logits > 0
     elif answers is None and (recorded := steps.get("qaf", None)) is not None:
@@ -288,7 +288,7 @@ def _departs(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return whether plan and reference request different actions (T,) bool, and the chosen plan step of each (T,)."""
     observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
-    answers = plan_program(Plans([other]))(observation, task_id)
+    answers = truth_of_episode(Plans([other]), seen.steps)
     ours, theirs = chosen(seen.truth, len(plan.steps)), chosen(answers, len(other.steps))
     rows = torch.arange(len(ours))
     done = scripts.program(observation, task_id)[rows, ours]

@@ -163,6 +163,32 @@ def is_for_any_task(name: str) -> bool:
     return " ".join(words_of(name)) in PROGRAM_WORDS["any_task"]
 
 
+_CALL = re.compile(r"\b([A-Za-z]\w*)\(([^()]*)\)")
+_QUESTION = re.compile(r"(?:(?:is|are|does|has|do)\s+)?(.+?)\s*\?", re.IGNORECASE)
+
+
+def statement(text: str) -> str:
+    """Return a condition without the notation of code or of a question.
+
+    "IsNear(gripper, mug)" and "Is the gripper near the mug?" give "gripper near mug" and "the gripper near the mug".
+    """
+
+    def said(call: re.Match[str]) -> str:
+        first, *others = (each.strip(" '\"") for each in call[2].split(","))
+        words = " ".join([first, *words_of(call[1].removeprefix("is").removeprefix("Is")), *others])
+        return words if call[0] == text else f"({words})"
+
+    text = " ".join(_CALL.sub(said, text).replace("&&", "&").replace("||", "|").split())
+    question = _QUESTION.fullmatch(text)
+    return (question[1] if question else text).replace(" & ", " and ").replace(" | ", " or ")
+
+
+def command(text: str) -> str:
+    """Return an action without the notation of code: "MoveTo(mug)" gives "move to mug"."""
+    call = _CALL.fullmatch(text)
+    return " ".join([*words_of(call[1]), *call[2].replace(",", " ").split()]) if call else text
+
+
 _FENCE = re.compile(r"^[ \t]*(?:```|~~~).*$", re.MULTILINE)
 
 

@@ -35,6 +35,8 @@ from lw_torchrl.language.programs import (
 )
 
 PYTHON = PROGRAM_WORDS["python"]
+_RELATIONS = [*PROGRAM_WORDS["prepositions"], "of", "aligned"]  # the last words of relations
+_COMMENTS = PROGRAM_WORDS["keys"]["comment"]
 _MOST_REPAIRS = 8  # maximum number of syntax errors to cut off
 _MOST_TEXTS = 64  # maximum number of values of a text that depends on conditions
 _LONGEST = 1_000  # maximum length of a text (characters)
@@ -59,7 +61,7 @@ class _Choice:
 
 
 _Text: TypeAlias = str | _Choice
-_Value: TypeAlias = Expression | _Text | list[ast.expr] | ast.Lambda
+_Value: TypeAlias = Expression | _Text | list[ast.expr] | ast.Lambda | ast.Dict
 
 
 class CodeReading(Reading):
@@ -113,6 +115,22 @@ class _Module:
         for name, function in self.functions.items():
             calls = (node for node in ast.walk(function) if isinstance(node, ast.Call))
             called |= {helper for call in calls if (helper := self.helper(call)) and helper != name}
+        # The names of the fields of records, such as ``Rule(when, then)``.
+        self.fields = {
+            node.name: [
+                each.target.id
+                for each in node.body
+                if isinstance(each, ast.AnnAssign) and isinstance(each.target, ast.Name)
+            ]
+            for node in ast.walk(module)
+            if isinstance(node, ast.ClassDef)
+        }
+        # The constants of the module and its classes; a method's ``self.SIDE`` is the constant SIDE.
+        self.constants = _Scope(self, {})
+        classes = [node.body for node in module.body if isinstance(node, ast.ClassDef)]
+        for node in (node for body in (module.body, *classes) for node in body):
+            if isinstance(node, ast.Assign | ast.AnnAssign) and not isinstance(node.value, ast.Call | None):
+                self.constants.statement(node)
         outside = [node for node in module.body if not isinstance(node, _Function | ast.ClassDef)]
         self.section("", 1, outside, {name for name in self.functions if name not in called})
         for name, function in self.functions.items():
@@ -129,7 +147,7 @@ class _Module:
 
     def section(self, task: str, line: int, body: Sequence[ast.stmt], roots: set[str]) -> None:
         """Add a section with the tree of the given statements, without calls to the functions in ``roots``."""
-        tree = _Scope(self, {}, roots).block(body)
+        tree = _Scope(self, dict(self.constants.values), roots).block(body)
         if next(actions_of(tree), None) is not None:
             self.reading.add_tree(task, line, tree)
 
@@ -236,12 +254,14 @@ class _Scope:
     def rounds(self, node: ast.stmt, target: ast.expr, iterated: ast.expr, body: list[ast.stmt]) -> list[Node]:
         """Unroll a loop over written values; keep the body of any other loop once."""
         items = self.items(iterated)
-        if items is None or not isinstance(target, ast.Name):
+        names = [each.id for each in getattr(target, "elts", [target]) if isinstance(each, ast.Name)]
+        if items is None or not names:
             self.note(node, f"the body of 'for ... in {shown(ast.unparse(iterated))}' is kept once, without its count")
             return [*self.block(body).parts]
         parts = list[Node]()
         for each in items if self.count(len(items)) else ():
-            self.values[target.id] = self.value(each)
+            pairs = zip(names, self.items(each) or [] if isinstance(target, ast.Tuple) else [each], strict=False)
+            self.values |= {name: self.value(value) for name, value in pairs}
             parts += self.block(body).parts
         return parts
 
@@ -251,7 +271,9 @@ class _Scope:
         return self.module.count <= _MOST_INLINED
 
     def assign(self, name: str, value: ast.expr) -> list[Node]:
-        called = isinstance(value, ast.Call) and not self.module.helper(value) and self.text(value) is None
+        if isinstance(value, ast.Await):
+            value = value.value
+        called = isinstance(value, ast.Call) and not self.module.helper(value) and self.argument(value) is None
         if called and self.is_action(value) and not _is_check(value):  # type: ignore[arg-type]
             return self.expression(value)
         self.values[name] = self.value(value)
@@ -271,6 +293,8 @@ class _Scope:
                 return [part for value in values for part in self.expression(value, True)]
             case ast.Call() if name := self.module.helper(node):
                 return self.inline(node, name)
+            case ast.Call(func=function) if isinstance(known := self.entry(function), ast.Lambda) and self.count(1):
+                return self.expression(known.body, is_returned)
             case ast.Call() if self.text(node) is None:
                 return self.call(node)
         text = self.text(node) if is_returned else None
@@ -285,6 +309,8 @@ class _Scope:
             self.left_out(node, "the call is not a skill")
             return []
         receiver, verb = self.receiver(node.func), words_of(_name(node.func))
+        if _is_carrier(node):
+            receiver, verb = "", [""]
         named = {
             each.arg: text for each in node.keywords if each.arg and (text := self.argument(each.value)) is not None
         }
@@ -299,21 +325,20 @@ class _Scope:
         parts: list[_Text] = [verb[0], receiver, " ".join(verb[1:])]
         parts += [text for each in node.args if (text := self.argument(each)) is not None]
         for name, text in named.items():
+            if name in _COMMENTS:
+                continue
             parts += [name.rstrip("_"), text] if name.rstrip("_") in PROGRAM_WORDS["prepositions"] else [text]
         return [_action(_joined(parts), node.lineno, goal)]
 
     def is_action(self, node: ast.Call) -> bool:
         """Return whether a call is a skill: a method of the robot, or a function whose first word is a verb."""
         root, dot, _ = ast.unparse(node.func).removeprefix("self.").partition(".")
-        return root in PYTHON["robots"] if dot else is_verb(words_of(_name(node.func))[:1])
+        is_skill = is_verb(words_of(_name(node.func))[:1])
+        return _is_carrier(node) or (root in PYTHON["robots"] or (is_skill and _is_owner(root)) if dot else is_skill)
 
-    def receiver(self, node: ast.expr) -> str:
+    def receiver(self, node: ast.expr) -> _Text:
         """Return the words before a method's name, without the robot: "gripper" in ``robot.gripper.close()``."""
-        words = list[str]()
-        while isinstance(node, ast.Attribute):
-            node = node.value
-            words = [*words_of(_name(node)), *words]
-        return " ".join(word for word in words if word not in PYTHON["owners"])
+        return (self.argument(node.value) or "") if isinstance(node, ast.Attribute) else ""
 
     def argument(self, node: ast.expr) -> _Text | None:
         """Return the words of a call's argument; None for numbers and the like."""
@@ -321,11 +346,18 @@ class _Scope:
             case ast.Constant(value=value):
                 return value if isinstance(value, str) else None
             case ast.Name(id=name) if name not in self.values:
-                return None if name in PYTHON["owners"] else " ".join(words_of(name))
-            case ast.Attribute():
-                return f"{self.receiver(node)} {' '.join(words_of(_name(node)))}".strip()
-            case ast.Subscript(slice=ast.Constant(value=str(value))):
-                return " ".join(words_of(value))
+                return None if _is_owner(name) else PYTHON["names"].get(name) or " ".join(words_of(name))
+            case ast.Attribute(value=ast.Name(id="self"), attr=name) if name in self.module.constants.values:
+                return self.argument(ast.Name(name))
+            case ast.Attribute() | ast.Subscript() if self.entry(node) is not None:
+                return self.text(node)
+            case ast.Attribute(attr=name):
+                words = [] if name in PYTHON["fields"] or _is_owner(name) else [" ".join(words_of(name))]
+                return _joined([self.receiver(node), *words])
+            case ast.Subscript(value=value, slice=key) if self.table(value) is None:
+                return self.argument(key)
+            case ast.Call() if words_of(_name(node.func))[:1] in (["get"], ["find"], ["object"]) and node.args:
+                return self.argument(node.args[0])
         return self.text(node)
 
     def inline(self, node: ast.Call, name: str) -> list[Node]:
@@ -351,19 +383,56 @@ class _Scope:
         written = (
             defaults | dict(zip(names, node.args, strict=False)) | {e.arg: e.value for e in node.keywords if e.arg}
         )
-        values = {key: self.value(each) for key, each in written.items() if not _is_owner(each)}
-        return _Scope(self.module, values)
+        values = {key: self.value(each) for key, each in written.items() if self.argument(each) != ""}
+        outer = {key: value for key, value in self.values.items() if key not in names}
+        return _Scope(self.module, outer | values)
 
     # Values
 
     def value(self, node: ast.expr) -> _Value:
-        """Return the value of an expression: a text, a list, a function, or otherwise a condition."""
-        if isinstance(node, ast.Lambda):
-            return node
-        if (text := self.text(node)) is not None:
+        """Return the value of an expression: a text, a list, a table, a function, or otherwise a condition."""
+        match node:
+            case ast.Lambda() | ast.Dict():
+                return node
+            case ast.Call() if (table := self.table(node)) is not None:
+                return table
+            case ast.Constant(value=None):
+                return ""
+            case ast.Call() if name := self.module.helper(node):
+                return self.called(node, name)
+        text = self.argument(node)
+        if text is not None:
             return text
         items = self.items(node)
         return self.condition(node) if items is None else items
+
+    def table(self, node: ast.expr) -> ast.Dict | None:
+        """Return a written dictionary; a record such as ``Rule(when=..., then=...)`` is one, too."""
+        node = self.entry(node) or node
+        if isinstance(node, ast.Call) and (fields := self.module.fields.get(_name(node.func))):
+            pairs = dict(zip(fields, node.args, strict=False)) | {e.arg: e.value for e in node.keywords if e.arg}
+            return ast.Dict([ast.Constant(name) for name in pairs], [*pairs.values()])
+        return node if isinstance(node, ast.Dict) else None
+
+    def entry(self, node: ast.expr) -> ast.expr | None:
+        """Return the table or function that a name stands for, or the entry of a table at a written key."""
+        match node:
+            case ast.Name(id=name) | ast.Attribute(value=ast.Name(id="self"), attr=name):
+                value = self.values.get(name)
+                return value if isinstance(value, ast.expr) else None
+            case ast.Attribute(value=owner, attr=key) | ast.Subscript(value=owner, slice=ast.Constant(value=key)):
+                if (table := self.table(owner)) is not None:
+                    pairs = zip(table.keys, table.values, strict=True)
+                    return next((each for k, each in pairs if isinstance(k, ast.Constant) and k.value == key), None)
+        return None
+
+    def text_at(self, table: ast.Dict, key: _Value) -> _Text | None:
+        """Return the text in a table for a key that may depend on conditions."""
+        if isinstance(key, _Choice):
+            then, otherwise = self.text_at(table, key.then), self.text_at(table, key.otherwise)
+            return _Choice(key.condition, then or "", otherwise or "") if then or otherwise else None
+        texts = {self.argument(each): value for each, value in zip(table.keys, table.values, strict=True) if each}
+        return self.text(texts[key]) if isinstance(key, str) and key in texts else None
 
     def items(self, node: ast.expr) -> list[ast.expr] | None:
         """Return the elements of a written list."""
@@ -379,6 +448,12 @@ class _Scope:
             case ast.Name(id=name):
                 known = self.values.get(name)
                 return known if isinstance(known, str | _Choice) else None
+            case ast.Attribute() | ast.Subscript() if (entry := self.entry(node)) is not None:
+                return self.text(entry)
+            case ast.Subscript(value=value, slice=key) if (table := self.table(value)) is not None:
+                return self.text_at(table, self.value(key))
+            case ast.Call(func=ast.Attribute(value=value, attr="get"), args=[key, *_]) if table := self.table(value):
+                return self.text_at(table, self.value(key))
             case ast.JoinedStr(values=values):
                 return _joined([text for each in values if (text := self.argument(each)) is not None], "")
             case ast.FormattedValue(value=value):
@@ -394,6 +469,8 @@ class _Scope:
     def condition(self, node: ast.expr) -> Expression:
         """Return the condition of an expression. Code that is not a condition becomes a leaf with its source."""
         match node:
+            case ast.Await(value=value):
+                return self.condition(value)
             case ast.BoolOp(op=op, values=values):
                 return (all_of if isinstance(op, ast.And) else any_of)(map(self.condition, values))
             case ast.UnaryOp(op=ast.Not(), operand=operand):
@@ -411,6 +488,21 @@ class _Scope:
                 return known
             case ast.Compare(left=left, ops=[ast.Is() | ast.Eq()], comparators=[ast.Constant(value=bool(value))]):
                 return self.condition(left) if value else negate(self.condition(left))
+            case ast.Compare(left=ast.Call(args=[_, _]) as call, ops=[op]) if words_of(_name(call.func))[:1] in (
+                ["distance"],
+                ["dist"],
+            ):
+                pair = [text for each in call.args if (text := self.argument(each)) is not None]
+                near = _leaf(_joined([*pair[:1], "near", *pair[1:]]))
+                self.note(node, f"the threshold in {shown(ast.unparse(node))} is read as that of 'near'")
+                return near if isinstance(op, ast.Lt | ast.LtE) else negate(near)
+            case ast.Compare(left=ast.Name(id=name), ops=[op], comparators=[right]) if (
+                isinstance(known := self.values.get(name), str | _Choice)
+                and (isinstance(known, _Choice) or ast.unparse(right) == "None")
+                and isinstance(other := self.value(right), str)
+            ):
+                equal = _equals(known, other)
+                return negate(equal) if isinstance(op, ast.NotEq | ast.IsNot) else equal
             case ast.Compare(left=left, ops=[ast.Is() | ast.Eq() | ast.NotEq() as op], comparators=[right]):
                 words = [self.argument(left), "is", self.argument(right)]
                 if None not in words:
@@ -420,20 +512,20 @@ class _Scope:
                 return (any_of if name == "any" else all_of)(self.parts(argument))
             case ast.Call(func=ast.Name(id="bool"), args=[argument]):
                 return self.condition(argument)
-            case ast.Call(func=ast.Name(id=name), args=args) if isinstance(known := self.values.get(name), ast.Lambda):
-                names = [each.arg for each in known.args.args]
+            case ast.Attribute() | ast.Subscript() if (entry := self.entry(node)) is not None:
+                return self.condition(entry)
+            case ast.Call(func=function, args=args) if isinstance(called := self.entry(function), ast.Lambda):
+                names = [each.arg for each in called.args.args]
                 inner = {key: self.value(each) for key, each in zip(names, args, strict=False)}
-                return _Scope(self.module, self.values | inner).condition(known.body) if self.count(1) else FALSE
+                return _Scope(self.module, self.values | inner).condition(called.body) if self.count(1) else FALSE
             case ast.Call() if name := self.module.helper(node):
-                if (scope := self.inner(node, name)) is not None:
-                    self.module.stack.append(name)
-                    returned = scope.returned(self.module.functions[name].body)
-                    self.module.stack.pop()
-                    return returned
+                return _truth(self.called(node, name))
             case ast.Call() if (text := self.question(node)) is not None:
                 return _leaf(text)
-            case ast.Attribute():
-                return _leaf(str(self.argument(node)))
+            case ast.Attribute() if self.module.helper(property := ast.Call(node, [], [])):
+                return self.condition(ast.copy_location(property, node))
+            case ast.Attribute() if (text := self.argument(node)) is not None:
+                return _leaf(text)
         text = self.text(node)
         return as_expression(ast.unparse(node)) if text is None else _leaf(text)
 
@@ -452,23 +544,33 @@ class _Scope:
         """Return the words of a call in a condition: "gripper is above puck" for ``gripper.is_above(puck)``."""
         words = [text for each in node.args if (text := self.argument(each)) is not None]
         words += [text for each in node.keywords if (text := self.argument(each.value)) is not None]
-        if _is_check(node) and words:
+        is_sentence = len(words) > 2 or any(isinstance(each, str) and len(each.split()) > 3 for each in words)
+        if words and (_is_check(node) or is_sentence):
             return _joined(words)
-        receiver, name = self.receiver(node.func), " ".join(words_of(_name(node.func)))
-        if not receiver and len(words) > 1:
-            receiver, *words = words  # type: ignore[assignment]
-        return _joined([receiver, name, *words]) or None
+        receiver, name = self.receiver(node.func), words_of(_name(node.func))
+        if len(words) > 1 or (words and not receiver and name[-1:] != ["holding"] and name[-1] not in _RELATIONS):
+            receiver, *words = words
+        return _joined([receiver, " ".join(name), *words]) or None
 
-    def returned(self, body: Sequence[ast.stmt]) -> Expression:
-        """Return the condition that a helper function returns."""
+    def called(self, node: ast.Call, name: str) -> _Value:
+        """Return the value that a helper function returns."""
+        if (scope := self.inner(node, name)) is None:
+            return as_expression(ast.unparse(node))
+        self.module.stack.append(name)
+        returned = scope.returned(self.module.functions[name].body)
+        self.module.stack.pop()
+        return returned
+
+    def returned(self, body: Sequence[ast.stmt]) -> _Value:
+        """Return the value that the statements of a function return."""
         for number, statement in enumerate(body):
             match statement:
                 case ast.Return(value=value):
-                    return FALSE if value is None else self.condition(value)
+                    return FALSE if value is None else self.value(value)
                 case ast.If(test=test, body=then, orelse=orelse):
                     rest, condition = body[number + 1 :], self.condition(test)
                     inner = _Scope(self.module, dict(self.values))
-                    return choose(condition, inner.returned([*then, *rest]), self.returned([*orelse, *rest]))
+                    return _chosen(condition, inner.returned([*then, *rest]), self.returned([*orelse, *rest]))
                 case ast.Assign(targets=[ast.Name(id=name)], value=value):
                     self.values[name] = self.value(value)
         return FALSE
@@ -479,8 +581,14 @@ def _name(node: ast.expr) -> str:
     return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
 
 
-def _is_owner(node: ast.expr) -> bool:
-    return isinstance(node, ast.Name) and node.id in PYTHON["owners"]
+def _is_owner(name: str) -> bool:
+    """Return whether a name stands for the robot or its observation, not for an object."""
+    return name in PYTHON["owners"] or (len(name) == 1 and name not in PYTHON["names"])
+
+
+def _is_carrier(node: ast.Call) -> bool:
+    """Return whether the arguments of a call name the skill: ``robot.do("close the gripper")``."""
+    return " ".join(words_of(_name(node.func))) in PYTHON["carriers"] and bool(node.args)
 
 
 def _is_check(node: ast.Call) -> bool:
@@ -503,19 +611,31 @@ def _leaf(text: _Text) -> Expression:
     """Return a condition in words."""
     if isinstance(text, _Choice):
         return choose(text.condition, _leaf(text.then), _leaf(text.otherwise))
-    return as_expression(" ".join(text.split()))
+    return as_expression(" ".join(text.split())) if text else FALSE
+
+
+def _equals(text: _Text, other: str) -> Expression:
+    """Return the condition that a text is equal to another one."""
+    if isinstance(text, _Choice):
+        return choose(text.condition, _equals(text.then, other), _equals(text.otherwise, other))
+    return TRUE if text == other else FALSE
+
+
+def _truth(value: _Value) -> Expression:
+    """Return a value as a condition."""
+    return _leaf(value) if isinstance(value, str | _Choice) else value if isinstance(value, Expression) else FALSE
 
 
 def _action(text: _Text, line: int, goal: str = "") -> Node:
     if isinstance(text, _Choice):
         return Branch(text.condition, _action(text.then, line, goal), _action(text.otherwise, line, goal))
-    return Action(" ".join(text.split()), line, goal)
+    return Action(" ".join(text.split()), line, goal) if text or goal else Block()
 
 
 def _chosen(condition: Expression, then: _Value, otherwise: _Value | None) -> _Value:
     """Return the value of a variable after a branch."""
-    if isinstance(then, Expression) and isinstance(otherwise, Expression):
-        return choose(condition, then, otherwise)
+    if isinstance(then, Expression) or isinstance(otherwise, Expression):
+        return then if otherwise is None else choose(condition, _truth(then), _truth(otherwise))
     if isinstance(then, str | _Choice) and isinstance(otherwise, str | _Choice) and then != otherwise:
         return _Choice(condition, then, otherwise)
     return then

@@ -12,7 +12,16 @@ from typing import Any
 
 from lw_torchrl._util.checks import shown
 from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, as_expression, negate
-from lw_torchrl.language.formats.base import PROGRAM_WORDS, Reading, code_blocks, in_turn, is_verb, words_of
+from lw_torchrl.language.formats.base import (
+    PROGRAM_WORDS,
+    Reading,
+    code_blocks,
+    command,
+    in_turn,
+    is_verb,
+    statement,
+    words_of,
+)
 from lw_torchrl.language.programs import (
     Block,
     Branch,
@@ -31,6 +40,8 @@ _TYPES = {word: kind for kind, words in PROGRAM_WORDS["types"].items() for word 
 _MOST_VALUES = 20_000  # YAML's references can repeat a value
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|//[^\n]*|/\*.*?\*/|#[^\n]*|[^"\[\]{},/#]+|.', re.DOTALL)
 _YAML = re.compile(r"^\s*(?:- )?[\w -]{1,40}:(?:\s|$)", re.MULTILINE)
+_NUMBERED = re.compile(r"[a-z]+ \d+")
+_CODE = re.compile(r"^\s*(?:async )?(?:def|class) \w", re.MULTILINE)
 
 
 class TreeReading(Reading):
@@ -39,18 +50,18 @@ class TreeReading(Reading):
     def __init__(self, text: str) -> None:
         super().__init__()
         for start, block in code_blocks(text):
-            value = _json(block)
-            value = _yaml(block) if value is None else value
+            value = self.parse(block, start)
             if not isinstance(value, dict | list):
                 continue
-            tree = _Tree(self, block, start)
+            tree = _Tree(self, block, start, _definitions(value))
             try:
                 node = tree.node(value)
             except (RecursionError, ValueError):
                 self.error = "the tree is too large or nests too deeply"
                 continue
-            is_listing = "{" not in str(value)
             texts = [action.text.split() for action in actions_of(node)]
+            # A list of texts in prose is not a plan.
+            is_listing = "{" not in str(value) and not _has_branch(node)
             if (
                 node is not None
                 and texts
@@ -58,12 +69,49 @@ class TreeReading(Reading):
             ):
                 self.add_tree("", start + 1, node)
 
+    def parse(self, block: str, start: int) -> Any:
+        """Parse JSON or YAML; None if the text is neither."""
+        bracket = re.search(r"[{\[]", block)
+        before = block if bracket is None else block[: bracket.start()]
+        is_yaml = len(_YAML.findall(before)) > 1 and not _CODE.search(block)
+        value = None if is_yaml or bracket is None else _json(block[bracket.start() :])
+        if value is not None or len(_YAML.findall(block)) < 2 or _CODE.search(block):
+            return value
+        try:
+            return _yaml(block)
+        except ImportError:
+            self.note(start + 1, "this may be YAML, which needs PyYAML to be read; run: pip install pyyaml")
+            return None
+
+
+def _has_branch(node: Node | None) -> bool:
+    return isinstance(node, Branch) or any(map(_has_branch, getattr(node, "parts", ())))
+
+
+def _definitions(value: Any) -> dict[str, Any]:
+    """Return the programs and conditions that a text defines by name, such as {"subtrees": {"grasp": ...}}."""
+    found = dict[str, Any]()
+    stack = [value]
+    for each in stack:  # grows
+        if isinstance(each, dict):
+            for key, inner in each.items():
+                if " ".join(words_of(str(key))) in _KEYS["definitions"]:
+                    rows = inner if isinstance(inner, list) else []
+                    found |= (
+                        inner
+                        if isinstance(inner, dict)
+                        else {str(row["id"]): row for row in rows if isinstance(row, dict) and "id" in row}
+                    )
+            stack += each.values()
+        elif isinstance(each, list):
+            stack += each
+        if len(stack) > _MOST_VALUES:
+            break
+    return found
+
 
 def _json(text: str) -> Any:
     """Parse JSON, with comments, trailing commas and missing brackets; None if the text is not JSON."""
-    if (start := re.search(r"[{\[]", text)) is None:
-        return None
-    text = text[start.start() :]
     with suppress(ValueError, RecursionError):
         return json.loads(text)
     parts, closers = list[str](), list[str]()
@@ -97,22 +145,20 @@ def _json(text: str) -> Any:
 
 
 def _yaml(text: str) -> Any:
-    """Parse YAML without its types; None if the text is not YAML, or if PyYAML is not installed."""
-    if len(_YAML.findall(text)) < 2:
-        return None
-    with suppress(ImportError):
-        import yaml  # type: ignore[import-untyped]
+    """Parse YAML without its types; None if the text is not YAML."""
+    import yaml  # type: ignore[import-untyped]
 
-        with suppress(yaml.YAMLError, ValueError, RecursionError):
-            return yaml.load(text, getattr(yaml, "CBaseLoader", yaml.BaseLoader))
+    with suppress(yaml.YAMLError, ValueError, RecursionError):
+        return yaml.load(text, getattr(yaml, "CBaseLoader", yaml.BaseLoader))
     return None
 
 
 class _Tree:
     """The conversion of a JSON value to a program."""
 
-    def __init__(self, reading: Reading, text: str, start: int) -> None:
+    def __init__(self, reading: Reading, text: str, start: int, definitions: Mapping[str, Any]) -> None:
         self.reading, self.text, self.start, self.at, self.count = reading, text, start, 0, 0
+        self.definitions, self.opened = definitions, list[str]()  # opened: the definitions that are being read
 
     def line(self, text: str) -> int:
         """Return the line of the next occurrence of a text."""
@@ -128,19 +174,42 @@ class _Tree:
         if self.count > _MOST_VALUES:
             raise ValueError("too many values")
         if isinstance(value, str):
-            return in_turn(value, self.line(value)) if value.strip() else None
+            return self.leaf(value.strip())
         if isinstance(value, list):
-            nodes = [node for each in value if (node := self.node(each)) is not None]
+            if value and isinstance(value[0], str) and (kind := _TYPES.get(value[0].lower())):  # ["sequence", ...]
+                rest = value[1] if kind in ("condition", "action") and len(value) == 2 else value[1:]
+                return self.object({"type": kind, "text" if isinstance(rest, str) else "children": rest})
+            pairs = [each for each in value if isinstance(each, list) and len(each) == 2]
+            if pairs == value and all(isinstance(test, str) and is_verb(str(then).split()) for test, then in pairs):
+                value = [{"if": test, "then": then} for test, then in pairs]
+            nodes = self.children(value)
             rules = is_rule_list or any(isinstance(each, Branch) for each in nodes)
             return None if not nodes else Selector(tuple(nodes)) if rules else Sequence(tuple(nodes))
         return self.object(_normal(value)) if isinstance(value, dict) else None
+
+    def leaf(self, text: str) -> Node | None:
+        """Convert a text to an action, a condition that ends with "?", or the program that it names."""
+        if text in self.definitions and text not in self.opened:
+            self.opened.append(text)
+            node = self.node(self.definitions[text])
+            self.opened.pop()
+            return node
+        if text.endswith("?"):
+            return Check(self.condition(text))
+        words = command(text)
+        return in_turn(words, self.line(text)) if words else None
 
     def object(self, row: dict[str, Any]) -> Node | None:
         kind = _TYPES.get(" ".join(words_of(str(_get(row, "type", "")))))
         memory = kind == "memory" or _is_true(_get(row, "memory"))
         kind = "sequence" if kind == "memory" else kind
-        condition, then = _get(row, "condition"), _get(row, "action")
+        condition, then = self.tests(row), _get(row, "action")
         children = _get(row, "children")
+        if isinstance(root := row.get("root"), str) and root in self.definitions:
+            return self.leaf(root)
+        if (reference := _get(row, "reference")) is not None and str(reference) in self.definitions:
+            node = self.leaf(str(reference))
+            return node if condition is None or node is None else Branch(condition, node)
         if (states := _get(row, "states")) is not None:
             return self.object(_normal(states)) if "states" in _normal(states) else self.machine(states, row)
         if kind in ("selector", "sequence", "not") and children is not None:
@@ -150,23 +219,32 @@ class _Tree:
             return Selector(parts) if kind == "selector" else Sequence(parts, memory)
         if kind == "condition":
             return Check(self.condition(row))
+        if any(_NUMBERED.fullmatch(key) and key.split(" ")[0] in _TYPES for key in row):
+            return Sequence(tuple(self.typed(row)))
         if kind == "action" or (kind is None and condition is None and isinstance(then, str)):
             return self.until(self.action(row), row)
         for role in ("rules", "sequence", "remembered"):
-            if (rules := _get(row, role)) is not None:
+            if isinstance(rules := _get(row, role), list | dict):
                 parts = tuple(self.children(rules))
-                last = self.node(_get(row, "otherwise"))
+                last = None if (other := _get(row, "otherwise")) is rules else self.node(other)
                 parts = parts if last is None else (*parts, last)
                 if role == "rules" or last is not None:
                     return Selector(parts)
                 if memory or role == "remembered":
                     return Sequence(parts, memory=True)
+                if (
+                    parts and isinstance(parts[-1], Branch) and parts[-1].condition == TRUE
+                ):  # the last rule is the default
+                    return Selector(parts)
                 return (Block if any(isinstance(part, Branch) for part in parts) else Sequence)(parts)
         if condition is not None:
-            test = negate(self.condition(condition)) if "unless" in row else self.condition(condition)
-            test = negate(test) if _is_true(_get(row, "negate")) else test
+            test = negate(condition) if _is_true(_get(row, "negate")) else condition
             body = self.node(children if then is None else then)
             otherwise = self.node(_get(row, "otherwise"))
+            if (
+                "if" in row and (then_elif := row.get("then elif")) is not None
+            ):  # "elif" and "then_elif" of the same object
+                otherwise = Branch(self.condition(row.get("elif")), self.node(then_elif) or Sequence(), otherwise)
             if body is None and otherwise is None:
                 return Check(test)
             if "while" in row or kind == "loop":
@@ -177,9 +255,13 @@ class _Tree:
         if then is not None or children is not None:
             body = self.node(children if then is None else then)
             return None if body is None else self.until(body, row)
+        if (otherwise := _get(row, "otherwise")) is not None:
+            return self.node(otherwise)
+        if typed := self.typed(row):
+            return typed[0] if len(typed) == 1 else Sequence(tuple(typed))
         values = [each for each in row.values() if isinstance(each, dict | list)]
-        if len(values) == 1:  # a name, with the program
-            return self.node(values[0])
+        if len(values) == 1 or (values and all(key.isdigit() for key in row)):  # a name or numbers, with programs
+            return self.node(values[0] if len(values) == 1 else values)
         if any(isinstance(each, str) for key, each in row.items() if key not in _KEYS["comment"] + _KEYS["name"]):
             self.reading.note(
                 self.line(next(each for each in row.values() if isinstance(each, str))),
@@ -187,9 +269,44 @@ class _Tree:
             )
         return None
 
+    def tests(self, row: Mapping[str, Any]) -> Expression | None:
+        """Return the condition of the keys "if", "unless" and the like; None without any."""
+        if (condition := _get(row, "condition")) is None and "unless" not in row:
+            return None
+        unless = [negate(self.condition(row["unless"]))] if "unless" in row else []
+        return all_of([*([] if condition is None else [self.condition(condition)]), *unless])
+
+    def typed(self, row: Mapping[str, Any]) -> list[Node]:
+        """Return the parts of an object whose keys begin with a type: {"condition 1": ..., "sequence push": ...}."""
+        parts = list[Node]()
+        kinds = [(key.split(" ")[0].rstrip("0123456789"), each) for key, each in row.items()]
+        if sum(word in _TYPES for word, _ in kinds) < 2 and not any(map(_NUMBERED.fullmatch, row)):
+            return []
+        for word, each in kinds:
+            kind = _TYPES.get(word)
+            if kind == "condition":
+                parts.append(Check(self.condition(each)))
+            elif kind in ("selector", "sequence"):
+                parts.append((Selector if kind == "selector" else Sequence)(tuple(self.children(each))))
+            elif kind is not None and (node := self.node(each)) is not None:
+                parts.append(node)
+        return parts
+
     def children(self, value: Any) -> list[Node]:
+        if isinstance(value, dict):
+            row = _normal(value)
+            nested = _get(row, "children")
+            return self.typed(row) or self.children([value] if nested is None else nested)
         values = value if isinstance(value, list) else [value]
-        return [node for each in values if (node := self.node(each)) is not None]
+        nodes = list[Node]()
+        for number, each in enumerate(values):
+            # In a sequence of texts, those that do not begin with a verb are conditions.
+            is_test = isinstance(each, str) and number + 1 < len(values) and each not in self.definitions
+            if is_test and not is_verb(command(each).split()):
+                nodes.append(Check(self.condition(each)))
+            elif (node := self.node(each)) is not None:
+                nodes.append(node)
+        return nodes
 
     def until(self, node: Node, row: Mapping[str, Any]) -> Node:
         """Run a program until the condition of the key "until", if there is one."""
@@ -199,8 +316,15 @@ class _Tree:
     def action(self, row: dict[str, Any]) -> Node:
         """Join the texts of an action, such as {"verb": "lower", "object": "the puck", "to": "the table"}."""
         key = next((each for each in (*_KEYS["action"], *_KEYS["text"]) if isinstance(row.get(each), str)), "")
-        words = [row.pop(key, "")]
-        line = self.line(words[0])
+        line = self.line(row.get(key, ""))
+        words = [command(row.pop(key, ""))]
+        explained = " ".join(words_of(str(row.get("description", "")))).split(" ")
+        if (
+            explained[0] == words[0].replace("_", " ").split(" ")[0]
+        ):  # {"skill": "push", "description": "push the door"}
+            return in_turn(str(row["description"]), line)
+        if isinstance(arguments := row.pop("args", None), list):
+            words += [str(each) for each in arguments]
         for name, value in row.items():
             if isinstance(value, str) and not any(name in _KEYS[role] for role in ("comment", "type", "name", "until")):
                 words.append(f"{name} {value}" if name in PROGRAM_WORDS["prepositions"] else value)
@@ -214,27 +338,45 @@ class _Tree:
         if isinstance(value, bool):
             return TRUE if value else FALSE
         if not isinstance(value, dict):
-            return as_expression(" ".join(str(value).split()))
+            return self.said(str(value).strip())
         row = _normal(value)
-        joins = _TYPES.get(" ".join(words_of(str(_get(row, "type", "")))))
+        joins = " ".join(words_of(str(_get(row, "type", ""))))
+        kind = _TYPES.get(joins)
         parts = list[Expression]()
         for role, join in (("all", all_of), ("any", any_of), ("not", any_of)):
             if (operands := _get(row, role)) is not None:
                 part = join(map(self.condition, operands if isinstance(operands, list) else [operands]))
                 parts.append(negate(part) if role == "not" else part)
+        relation = next((key for key in _KEYS["relation"] if isinstance(row.get(key), str)), "")
         inner = next(
-            (row[key] for key in (*_KEYS["condition"], *_KEYS["children"], "args", "operands") if key in row), None
+            (row[key] for key in (*_KEYS["condition"], *_KEYS["children"], *_KEYS["operands"]) if key in row), None
         )
-        if not parts and inner is not None:
-            listed = inner if isinstance(inner, list) else [inner]
-            parts = [(any_of if joins == "selector" else all_of)(map(self.condition, listed))]
-            parts = [negate(parts[0])] if joins == "not" else parts
-        if not parts:
+        if relation:
+            operands = row.get("args") or [_get(row, "subject", ""), _get(row, "object", "")]
+            first, *others = [str(each) for each in operands] if isinstance(operands, list) else [str(operands)]
+            part = self.said(" ".join([first, " ".join(words_of(row[relation])), *others]).strip())
+            parts.append(negate(part) if relation.endswith("not") else part)
+        elif not parts and inner is not None:
+            join = any_of if kind == "selector" or joins in _KEYS["any"] or joins in _KEYS["not"] else all_of
+            part = join(map(self.condition, inner if isinstance(inner, list) else [inner]))
+            parts = [negate(part) if kind == "not" or joins in _KEYS["not"] else part]
+        if not parts and joins not in PROGRAM_WORDS["always"]:
             skipped = (*_KEYS["comment"], *_KEYS["type"], *_KEYS["negate"])
             texts = [each for key, each in row.items() if isinstance(each, str) and key not in skipped]
-            parts = [as_expression(" ".join(" ".join(texts).split()))]
+            named = [each for key, each in row.items() if key in _KEYS["name"] and each in texts]
+            texts = [each for each in texts if each not in named] or texts
+            parts = [self.said(" ".join(texts))] if texts else []
         result = all_of(parts)
         return negate(result) if _is_true(_get(row, "negate")) else result
+
+    def said(self, text: str) -> Expression:
+        """Convert a text to a condition; a name that the text defines stands for its definition."""
+        if text in self.definitions and text not in self.opened:
+            self.opened.append(text)
+            condition = self.condition(self.definitions[text])
+            self.opened.pop()
+            return condition
+        return TRUE if text.lower() in PROGRAM_WORDS["always"] else as_expression(statement(text))
 
     def machine(self, states: Any, row: Mapping[str, Any]) -> Node | None:
         """Convert a state machine to a selector: a later state is active once a condition that leads to it is true, and
@@ -245,6 +387,8 @@ class _Tree:
             if isinstance(states, dict)
             else [_normal(each) for each in states if isinstance(each, dict)]
         )
+        if not any(_get(each, role) is not None for each in rows for role in ("transitions", "until")):
+            return Selector(tuple(node for each in rows if (node := self.object(each)) is not None))  # guarded states
         named = {str(_get(each, "name")): each for each in rows}
         nodes = {name: self.state(each) for name, each in named.items()}
         exits = {name: self.exits(each, nodes[name]) for name, each in named.items()}

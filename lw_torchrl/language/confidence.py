@@ -1,0 +1,141 @@
+"""The confidence in a plan: the fraction of typical states in which its active steps do what its motion needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lw_torchrl._util.files import read_toml
+from lw_torchrl.language.expressions import evaluate, leaves
+from lw_torchrl.language.layout import places
+from lw_torchrl.language.objects import GRIPPER, Coordinate
+from lw_torchrl.language.plans import PlanStep
+from lw_torchrl.language.queries import Clause, Query
+from lw_torchrl.language.relations import STATES, comparisons
+from lw_torchrl.language.roles import BY_HAND, StepRole, Verb, motion_of
+from lw_torchrl.language.step_parser import is_obstacle
+from lw_torchrl.language.tasks import Task, first_object, is_goal, point_on, role_object
+
+
+def role_of(step: PlanStep) -> StepRole:
+    """Return the role of a step of a canonical plan."""
+    assert step.role is not None
+    return step.role
+
+
+def touched_point(task: Task, roles: Sequence[StepRole]) -> str:
+    """Return the point that the hand touches: the target of the first step other than "approach", else of any step."""
+    hands = [role for role in roles if role.moved == GRIPPER != role.target and not is_goal(task, role.target)]
+    hands = [role for role in hands if not is_obstacle(role.target)] or hands
+    hand = min(hands, key=lambda role: role.verb == "approach", default=None)
+    name = first_object(task) if hand is None else hand.target
+    assert name is not None
+    return point_on(task, name)
+
+
+def _has_sides(roles: Sequence[StepRole]) -> bool:
+    """Return whether a plan has pushes from several sides, each with an approach to that side."""
+    sides = {role.target for role in roles if role.verb == "push"}
+    return len(sides) > 1 and all(any(role.target == side and role.verb in BY_HAND for role in roles) for side in sides)
+
+
+def confidence_of(task: Task, steps: Sequence[PlanStep]) -> float:
+    """Return the fraction of typical states of the plan's motion in which the active steps do what the motion needs."""
+    roles = [role_of(step) for step in steps]
+    motion = motion_of(roles)
+    if motion is None:
+        return 0.0
+    # Reaching and pushing from several sides have no typical states.
+    if motion.manner == "reach" or _has_sides(roles):
+        return 1.0
+    manner = "pull" if motion.verb == "pull" else motion.manner
+    return _coverage(task, touched_point(task, roles), manner, [(step.condition, role_of(step).verb) for step in steps])
+
+
+# The typical states are synthetic: objects and goal at fixed positions, and the hand at offsets from the touched point.
+_Floats = NDArray[np.float32]
+_OBJECTS = ((0.0, 0.6, 0.02), (0.2, 0.7, 0.02), (-0.2, 0.7, 0.02), (0.0, 0.8, 0.02))
+_GOAL = (0.1, 0.8, 0.2)
+_MOTIONS = read_toml(files("lw_torchrl.language") / "data" / "motions.toml", ValueError)
+_MOTIONS |= {motion: _MOTIONS["coming"] + _MOTIONS[motion] for motion in ("grasp", "pull")}
+_TYPICAL = {
+    motion: [(offset, opening, lift, {*verbs.split()}) for hands, opening, lift, verbs in rows for offset in hands]
+    for motion, rows in _MOTIONS.items()
+}
+
+
+def _coverage(task: Task, point: str, motion: str, steps: Sequence[tuple[Query, Verb]]) -> float:
+    """Return the fraction of typical states in which at least one step is active and every active step is right."""
+    good = [bool(active) and active <= right for active, right in _active(task, point, motion, steps)]
+    return sum(good) / len(good)
+
+
+def _active(
+    task: Task, point: str, motion: str, steps: Sequence[tuple[Query, Verb]]
+) -> Iterator[tuple[set[Verb], set[str]]]:
+    """Yield the verbs of the active steps and the right verbs in each typical state."""
+    for offset, opening, lift, verbs in _TYPICAL[motion]:
+        state = _state(task, point, offset, opening, lift)
+        yield {verb for query, verb in steps if _holds(query, task, state)}, verbs
+
+
+def moves_before_grasp(task: Task, steps: Sequence[PlanStep]) -> bool:
+    """Return whether a step that moves an object is active in a typical state in which the hand does not hold it."""
+    point = touched_point(task, [role_of(step) for step in steps])
+    moving: list[tuple[Query, Verb]] = [
+        (step.condition, "move") for step in steps if role_of(step).verb in ("carry", "move")
+    ]
+    return any(active for active, right in _active(task, point, "grasp", moving) if "move" not in right)
+
+
+def _state(task: Task, point: str, offset: Sequence[float], opening: float, lift: float) -> _Floats:
+    """Build an observation with the hand at ``offset`` from ``point`` and the touched object raised by ``lift`` (m)."""
+    touched, layout = role_object(task, point), task.layout
+    state = np.zeros(layout.size, np.float32)
+    for place, xyz in zip(layout.positions[1:-1], _OBJECTS, strict=False):
+        state[place] = xyz
+    state[layout.positions[-1]] = _GOAL
+    if at := [number for number in touched.position if isinstance(number, int)]:
+        state[at[-1]] += np.float32(lift)
+    hand = _position(touched.position, state) + _floats(touched.offset) + _floats(offset)
+    state[list(places(layout.positions[0]))] = hand
+    state[layout.opening] = opening
+    return state
+
+
+def _floats(numbers: Sequence[float]) -> _Floats:
+    return np.array(numbers, np.float32)
+
+
+def _position(position: Sequence[Coordinate], state: _Floats) -> _Floats:
+    """Return a position (3,) in a state, in metres."""
+    return _floats([state[at] if isinstance(at, int) else at for at in position])
+
+
+def _holds(query: Query, task: Task, state: _Floats) -> bool:
+    if query.is_conjunction:  # much faster, since it ends at the first clause that is false
+        return all(_is_true(clause, task, state) for clause in query.clauses)
+    return evaluate(query.expression, {leaf: _is_true(leaf, task, state) for leaf in leaves(query.expression)})
+
+
+def _is_true(clause: Clause, task: Task, state: _Floats) -> bool:
+    """Evaluate a clause without torch, in the precision and the order of operations of QueryProgram."""
+    second, shift = _floats((0.0, 0.0, 0.0)), np.zeros(3)
+    if clause.predicate in STATES:
+        first = _floats((0.0, 0.0, state[task.openings[clause.subject]]))
+    else:
+        subject = task.object(clause.subject)
+        first, shift = _position(subject.position, state), np.array(subject.offset)
+        if clause.object is not None:
+            other = task.object(clause.object)
+            second, shift = _position(other.position, state), shift - other.offset
+    truth = True
+    for part in comparisons(clause.predicate, task.layout):
+        d = first - second + _floats(shift + np.array((0.0, 0.0, part.raise_z)))
+        d = d[["xyz".index(axis) for axis in part.axes]]
+        value, threshold = np.sqrt((d * d).sum()) if part.length else d[0], np.float32(part.threshold)
+        truth &= bool({"<": value < threshold, ">": value > threshold, "<=": value <= threshold}[part.sense])
+    return truth != clause.negated
