@@ -122,7 +122,10 @@ class RowStates:
         the additional entries ``more``.
         """
         n = len(self.tasks)
-        over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
+        flags = np.empty((5, n, 1), dtype=bool)
+        flags[:4, :, 0] = self._flags
+        np.greater(flags[0], flags[1], out=flags[4])  # over, but not terminated
+        over, terminated, fault, success, truncated = torch.from_numpy(flags)
         if executed_action is None:
             executed_action = np.zeros((n, self.layout.action_size), dtype=np.float32)
         return TensorDict(
@@ -135,7 +138,7 @@ class RowStates:
                 "executed_action": torch.from_numpy(executed_action),
                 "done": over,
                 "terminated": terminated,
-                "truncated": over & ~terminated,
+                "truncated": truncated,
                 **more,
             },
             batch_size=(n,),
