@@ -122,10 +122,7 @@ class RowStates:
         the additional entries ``more``.
         """
         n = len(self.tasks)
-        flags = np.empty((5, n, 1), dtype=bool)
-        flags[:4, :, 0] = self._flags
-        np.greater(flags[0], flags[1], out=flags[4])  # over, but not terminated
-        over, terminated, fault, success, truncated = torch.from_numpy(flags)
+        over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
         if executed_action is None:
             executed_action = np.zeros((n, self.layout.action_size), dtype=np.float32)
         return TensorDict(
@@ -138,7 +135,7 @@ class RowStates:
                 "executed_action": torch.from_numpy(executed_action),
                 "done": over,
                 "terminated": terminated,
-                "truncated": truncated,
+                "truncated": over & ~terminated,
                 **more,
             },
             batch_size=(n,),
