@@ -46,7 +46,7 @@ def write_dataset(root: Path, rows: int) -> None:
 
 
 def measure(kind: str, number: int, root: str) -> dict[str, float]:
-    """Return the processor's seconds for each part on one thread, and the GB that the process used at most, without the imports."""
+    """Return the processor's seconds for each part on one thread, and the GB of memory used without the imports."""
     times, before = [process_time()], resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     if kind == "environments":
         env = lw.LanguageWorldEnv("MT50", num_envs=number, num_threads=1)
