@@ -24,6 +24,7 @@ import tyro
 from benchmarks import (
     environment,
     language,
+    large,
     pipelines,
     recording,
     sampling,
@@ -44,6 +45,7 @@ BENCHMARKS: dict[str, Callable[[Settings], list[Row]]] = {
     "overhead": environment.overhead,
     "reset": environment.reset,
     "construction": environment.construction,
+    "large": large.large,
     "queries": language.queries,
     "branches": language.branches,
     "skills": language.skills,

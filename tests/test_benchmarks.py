@@ -78,16 +78,12 @@ def test_failing_benchmark_is_reported_and_the_others_continue(tmp_path, monkeyp
 def test_scaling_prints_each_row_and_continues_after_an_error(tmp_path, monkeypatch, capfd):
     monkeypatch.setenv("OUT", str(tmp_path / "out"))
     (tmp_path / "out").mkdir()
-    names = ["machine", "cloning-step", "few-shot-success", "exactness"]
-    assert cli.main(["scaling", "--quick", "--folder", str(tmp_path / "run"), "--rows", *names]) == 1
+    (tmp_path / "done").touch()  # the demonstrations are missing
+    assert cli.main(["scaling", "--quick", "--folder", str(tmp_path), "--rows", "cloning", "machine"]) == 1
     report = json.loads((tmp_path / "out" / "scaling.json").read_text("utf-8"))
-    rows = {row["row"]: row for row in report["rows"]}
-    assert rows["success of few-shot"]["error"] == "not trained"
-    assert rows["same bits"] == {"row": "same bits"} | dict.fromkeys(
-        ("repeated", "resumed", "eager", "resumed eager"), True
-    )
-    printed = capfd.readouterr().out
-    assert all(f'"row": "{name}"' in printed for name in rows)
+    assert [row["row"] for row in report["rows"]] == ["cloning", "machine"]
+    assert report["rows"][0]["error"] == "exit status 1"
+    assert '"row": "machine"' in capfd.readouterr().out
 
 
 def test_rows_compare_medians_shares_and_factors_with_their_targets():

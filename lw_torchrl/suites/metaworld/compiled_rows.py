@@ -21,6 +21,7 @@ ROW = np.dtype(
         ("looks_ahead", np.int64),  # whether the next step may reuse this step's mj_forward
         ("looked", np.int64),  # whether the state is that of an mj_forward
         ("looks", np.int64),  # whether a step ends with mj_forward
+        ("has_matrix", np.int64),  # whether the outputs QUATERNION are those of the outputs MATRIX
         ("inputs", np.int64),  # number of inputs, which are written before the first substep
         ("zeros", np.int64),  # number of values that are set to zero after the last substep
         ("outputs", np.int64),  # number of outputs, which are read at the end

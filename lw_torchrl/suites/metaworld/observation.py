@@ -1,20 +1,21 @@
 """Sensor values read from the state after each step, and the observations and success flags computed from them."""
 
 from collections.abc import Callable, Sequence
+from math import sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from lw_torchrl.suites.metaworld.tables import TaskReward, TaskSources
+from lw_torchrl.suites.metaworld.tables import NO_OFFSET, TaskReward, TaskSources
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 # Columns of the sensor array. The first 18 are in the order of the observation, but column 3 (gripper opening) is
-# computed. Columns that a task does not use hold arbitrary numbers.
+# computed, and so are quaternions of tasks with a matrix. Columns that a task does not use hold zeros.
 HAND = slice(0, 3)
 GRIPPER = 3
 OBJECT = slice(4, 7)
@@ -78,12 +79,13 @@ def _address(array: Array) -> int:
 def sensor_index(window: StateView, sources: TaskSources, reward: TaskReward | None) -> Index:
     """Return the indices in ``window`` of a task's sensors, (WIDTH,), or (REWARD_WIDTH,) with a dense reward."""
     success = sources.success
-    parts = [(HAND, "body hand"), (OBJECT, sources.object)]
+    parts = [(HAND, "body hand"), (OBJECT, sources.object)]  # the body "world" is at zero, and not rotated
     parts += [(RIGHT_CLAW, "body rightclaw"), (LEFT_CLAW, "body leftclaw")]
     if sources.quaternion.startswith(MATRIX_OF):
         parts.append((MATRIX, sources.quaternion))
-    elif sources.quaternion not in ("zeros", "identity"):
-        parts.append((QUATERNION, f"quaternion of {sources.quaternion}"))
+    elif sources.quaternion != "zeros":
+        body = "body world" if sources.quaternion == "identity" else sources.quaternion
+        parts.append((QUATERNION, f"quaternion of {body}"))
     if sources.second is not None:
         parts.append((SECOND, sources.second))
         if sources.second_quaternion != "zeros":
@@ -103,7 +105,7 @@ def sensor_index(window: StateView, sources: TaskSources, reward: TaskReward | N
             parts.append((slice(start, start + 3), corner))
     if joint is not None:
         parts.append((JOINT, f"joint {joint}"))
-    index = np.zeros(WIDTH if reward is None else REWARD_WIDTH, dtype=np.intp)
+    index = np.full(WIDTH if reward is None else REWARD_WIDTH, window.find("body world")[0])
     for columns, what in parts:
         index[columns] = window.find(what)
     return index
@@ -119,30 +121,18 @@ class Observer:
     """
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
-        self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])
         self._dials = np.flatnonzero([row.dial is not None for row in sources])
-        self._offset = np.array([row.offset for row in sources], np.float64)
-        self._seconds = np.flatnonzero([row.second is not None for row in sources])
-        self._second_offset = np.array([row.second_offset for row in sources if row.second is not None], np.float64)
-        self._constant = np.zeros((len(sources), CURRENT.stop))
-        self._is_constant = np.zeros(self._constant.shape, dtype=bool)
-        for k, row in enumerate(sources):
-            self._is_constant[k, QUATERNION] = row.quaternion in ("zeros", "identity")
-            self._constant[k, QUATERNION.start] = row.quaternion == "identity"
-            self._is_constant[k, SECOND] = row.second is None
-            self._is_constant[k, SECOND_QUATERNION] = row.second is None or row.second_quaternion == "zeros"
+        self._offset = np.full((len(sources), CURRENT.stop), NO_OFFSET[0])
+        self._offset[:, OBJECT] = [row.offset for row in sources]
+        self._offset[:, SECOND] = [row.second_offset for row in sources]
 
-    def current(self, sensors: Array) -> Array:
-        """Return the part (rows, 18) of the observation that describes the current state."""
-        current = sensors[:, CURRENT].copy()
-        np.copyto(current, self._constant, where=self._is_constant)
+    def observe(self, sensors: Array) -> Array:
+        """Change the sensors (rows, WIDTH) in the columns CURRENT to the part of the observation that describes the
+        current state; return a view of these columns."""
+        current = sensors[:, CURRENT]
+        current += self._offset
         span = row_norm(sensors[:, RIGHT_CLAW] - sensors[:, LEFT_CLAW])
-        current[:, GRIPPER] = np.minimum(span / WIDEST_GRIP, 1.0)
-        current[:, OBJECT] += self._offset
-        if self._seconds.size:
-            current[self._seconds, SECOND] += self._second_offset
-        if self._matrices.size:
-            current[self._matrices, QUATERNION] = quaternion_of_matrix(sensors[self._matrices, MATRIX])
+        np.minimum(span / WIDEST_GRIP, 1.0, out=current[:, GRIPPER])
         if self._dials.size:
             angle = sensors[self._dials, JOINT.start]
             current[self._dials, OBJECT.start] += np.sin(angle) * DIAL_RADIUS
@@ -157,45 +147,33 @@ def row_norm(vectors: Array) -> Array:
     return np.sqrt(np.vecdot(vectors, vectors))
 
 
-def quaternion_of_matrix(matrix: Array) -> Array:
-    """Convert rotation matrices (n, 9) to quaternions (n, 4) in x, y, z, w order. The result is bit-identical to
-    SciPy's ``Rotation.from_matrix(...).as_quat()``, which is much slower.
+def quaternion_of_matrix(matrix: Any) -> tuple[float, float, float, float]:
+    """Convert a rotation matrix, nine numbers, to a quaternion in x, y, z, w order. The result is bit-identical to
+    SciPy's ``Rotation.from_matrix(...).as_quat()``, which is much slower. The kernel compiles this function.
     """
-    m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.T
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix
     trace = m00 + m11 + m22
-    quaternion = np.stack((m21 - m12, m02 - m20, m10 - m01, 1.0 + trace))
-    # Most objects are nearly upright, so w is the largest component. Otherwise SciPy first computes the largest
-    # component from the diagonal, then the other components from the largest one, which loses fewer digits.
-    tilted = np.flatnonzero((trace <= m00) | (trace <= m11) | (trace <= m22))
-    if tilted.size:
-        quaternion[:, tilted] = _quaternion_of_tilted(matrix[tilted].reshape(-1, 3, 3), trace[tilted]).T
-    x, y, z, w = quaternion * quaternion
-    return (quaternion / np.sqrt(x + y + z + w)).T
-
-
-def _quaternion_of_tilted(matrix: Array, trace: Array) -> Array:
-    """Convert rotation matrices (n, 3, 3) to unnormalized quaternions (n, 4) in x, y, z, w order.
-
-    w must not be the largest component.
-    """
-    row, i = np.arange(len(matrix)), np.diagonal(matrix, axis1=1, axis2=2).argmax(axis=1)
-    j, k = (i + 1) % 3, (i + 2) % 3
-    quaternion = np.empty((len(matrix), 4))
-    quaternion[row, i] = 1.0 - trace + 2.0 * matrix[row, i, i]
-    quaternion[row, j] = matrix[row, j, i] + matrix[row, i, j]
-    quaternion[row, k] = matrix[row, k, i] + matrix[row, i, k]
-    quaternion[:, 3] = matrix[row, k, j] - matrix[row, j, k]
-    return quaternion
+    # SciPy first computes the largest component, then the other components from it, which loses fewer digits.
+    if trace <= m00 or trace <= m11 or trace <= m22:
+        if m00 >= m11 and m00 >= m22:
+            x, y, z, w = 1.0 - trace + 2.0 * m00, m10 + m01, m20 + m02, m21 - m12
+        elif m11 >= m22:
+            x, y, z, w = m10 + m01, 1.0 - trace + 2.0 * m11, m21 + m12, m02 - m20
+        else:
+            x, y, z, w = m20 + m02, m21 + m12, 1.0 - trace + 2.0 * m22, m10 - m01
+    else:
+        x, y, z, w = m21 - m12, m02 - m20, m10 - m01, 1.0 + trace
+    length = sqrt(x * x + y * y + z * z + w * w)
+    return x / length, y / length, z / length, w / length
 
 
 class Scene(NamedTuple):
-    """The inputs of a success rule: whether each row's point is near the goal (rows,), sensors (rows, WIDTH), the first
-    18 values of the observations (rows, 18), goals (rows, 3), and points (rows, 3) that must reach the goals.
+    """The inputs of a success rule: whether each row's point is near the goal (rows,), observed sensors (rows, WIDTH),
+    goals (rows, 3), and points (rows, 3) that must reach the goals.
     """
 
     near: Mask
     sensors: Array
-    current: Array
     goal: Array
     point: Array
 
@@ -217,10 +195,12 @@ class SuccessFunction:
             np.array([getattr(row, name) for row in success], np.float64)
             for name in ("offset", "axes", "within", "under", "above", "angle")
         )
-        points = [row.point for row in success]
-        self._seconds = np.flatnonzero([point == "second" for point in points])
-        self._grippers = np.flatnonzero([point == "gripper" for point in points])
-        self._places = np.flatnonzero([point not in ("object", "second", "gripper") for point in points])
+        # A distance is at most ``within`` if it is less than the next larger number.
+        self._nearer_than = np.minimum(np.nextafter(self._within, np.inf), self._under)
+        columns = {"object": OBJECT.start, "second": SECOND.start}
+        self._columns = np.array([[columns.get(row.point, POINT.start)] for row in success]) + np.arange(3)
+        self._rows = np.arange(len(success))[:, None]
+        self._grippers = np.flatnonzero([row.point == "gripper" for row in success])
         self._at_height = np.flatnonzero([row.goal_height is not None for row in success])
         self._goal_height = np.array([row.goal_height for row in success if row.goal_height is not None], np.float64)
         rules = [row.rule for row in success]
@@ -229,22 +209,17 @@ class SuccessFunction:
             for name in sorted({rule for rule in rules if rule is not None})
         ]
 
-    def __call__(self, sensors: Array, current: Array, goal: Array) -> Mask:
-        """Compute the success (rows,) bool from sensors (rows, WIDTH), observations (rows, 18) and goals (rows, 3)."""
-        point = current[:, OBJECT].copy()
-        if self._seconds.size:
-            point[self._seconds] = current[self._seconds, SECOND]
+    def __call__(self, sensors: Array, goal: Array) -> Mask:
+        """Compute the success (rows,) bool from observed sensors (rows, WIDTH) and goals (rows, 3)."""
+        point = sensors[self._rows, self._columns]
         if self._grippers.size:
             tips = sensors[self._grippers]
             point[self._grippers] = (tips[:, RIGHT_TIP] + tips[:, LEFT_TIP]) / 2.0
-        if self._places.size:
-            point[self._places] = sensors[self._places, POINT]
         if self._at_height.size:
             goal = goal.copy()
             goal[self._at_height, 2] = self._goal_height
-        distance = row_norm((point + self._offset - goal) * self._axes)
-        success = (distance <= self._within) & (distance < self._under)
-        scene = Scene(success, sensors, current, goal, point)
+        success = row_norm((point + self._offset - goal) * self._axes) < self._nearer_than
+        scene = Scene(success, sensors, goal, point)
         for rule, rows in self._rules:
             success[rows] = rule(self, rows, scene)
         return success
@@ -255,7 +230,7 @@ class SuccessFunction:
 
     def _object_above_goal(self, rows: Index, scene: Scene) -> Mask:
         """Return whether the object is higher than the goal, regardless of x and y."""
-        return scene.current[rows, OBJECT.stop - 1] > scene.goal[rows, 2]
+        return scene.sensors[rows, OBJECT.stop - 1] > scene.goal[rows, 2]
 
     def _joint_above(self, rows: Index, scene: Scene) -> Mask:
         """Return whether the joint position is greater than ``above``."""
@@ -269,7 +244,7 @@ class SuccessFunction:
         """Return whether the container is at the goal and the end of the stick is through the container's handle."""
         held = scene.near[rows]
         if held.any():
-            end, handle = scene.sensors[rows, POINT], scene.current[rows, SECOND]
+            end, handle = scene.sensors[rows, POINT], scene.sensors[rows, SECOND]
             aside = np.abs(end - handle)
             held &= end[:, 0] >= handle[:, 0]
             held &= (aside[:, 1] <= STICK_SIDEWAYS) & (aside[:, 2] <= STICK_UPWARD)
@@ -279,7 +254,7 @@ class SuccessFunction:
         """Return whether the container is at the goal and the gripper holds the stick above the table."""
         held = scene.near[rows]
         for k in np.flatnonzero(held):
-            current, program = scene.current[rows[k]], self._programs(int(rows[k]))
+            current, program = scene.sensors[rows[k]], self._programs(int(rows[k]))
             lifted = current[OBJECT][2] - STICK_LIFT > program.stick_init_pos[2]
             if not (current[GRIPPER] > 0.0 and lifted):
                 held[k] = False

@@ -19,6 +19,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from lw_torchrl.suites.metaworld import observation
 from lw_torchrl.suites.metaworld.compiled_rows import ROW
 from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY, Places
 
@@ -58,6 +59,7 @@ _function(_system, "_setjmp", _int32, _pointer)
 _size_of_block = _system.malloc_usable_size
 _size_of_block.argtypes, _size_of_block.restype = [ctypes.c_void_p], ctypes.c_size_t
 _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
+_MATRIX, _QUATERNION = observation.MATRIX.start, observation.QUATERNION.start
 _CLOCK = int(time.CLOCK_MONOTONIC)
 
 # The key of a thread's jump buffer. Compiled code finds it by name, because cached code runs in several processes.
@@ -114,6 +116,10 @@ def leave_mujoco(message: Any) -> None:
     longjmp(get_of_thread(jump_key()), 1)
 
 
+# error_model="numpy" divides by zero without raising an error.
+quaternion_of_matrix = njit(observation.quaternion_of_matrix, cache=True, error_model="numpy")
+
+
 @njit(cache=True)
 def _seconds(scratch: Any) -> float:
     clock_gettime(_CLOCK, pointer(scratch.ctypes.data))
@@ -141,6 +147,13 @@ def _simulate_row(row: Any, inputs: Any, outputs: Any) -> None:
         mj_forward(model, data)
     for k in range(row.outputs):
         outputs[k] = carray(pointer(row.outputs_at[k]), (1,), np.float64)[0]
+    if row.has_matrix:
+        matrix = outputs[_MATRIX : _MATRIX + 9]
+        quaternion = quaternion_of_matrix(
+            (matrix[0], matrix[1], matrix[2], matrix[3], matrix[4], matrix[5], matrix[6], matrix[7], matrix[8])
+        )
+        for k in range(4):
+            outputs[_QUATERNION + k] = quaternion[k]
 
 
 @njit(cache=True)

@@ -20,8 +20,9 @@ from lw_torchrl._util.workers import available_cores
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
+from lw_torchrl.suites.metaworld import observation as at
 from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel
-from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, StateView, sensor_index
+from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, StateView
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
 from lw_torchrl.suites.metaworld.tables import TaskReward, TaskSources
 from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY, SharedModel
@@ -47,7 +48,8 @@ class SimulatedRow:
         self._control: Array = self._data.ctrl
         window = StateView(self._model, self._data)
         self._numbers = window.numbers
-        self._sensor_index = sensor_index(window, sources, reward)
+        self._sensor_index = at.sensor_index(window, sources, reward)
+        self._has_matrix = sources.quaternion.startswith(at.MATRIX_OF)
         self._looked = False
         self._warnings: NDArray[np.int32] = self._data.warning.number[UNSTABLE]
 
@@ -74,8 +76,14 @@ class SimulatedRow:
             mujoco.mj_step(self._model, self._data, self._substeps)
         mujoco.mj_forward(self._model, self._data)  # the next physics step starts its solver from these accelerations
         self._looked = True
-        self._numbers.take(self._sensor_index, out=outputs, mode="clip")
+        self.read_sensors(outputs)
         return bool((self._warnings == WARNED_ALREADY).all())
+
+    def read_sensors(self, outputs: Array) -> None:
+        """Fill (WIDTH,), or (REWARD_WIDTH,) with a dense reward, from the current state."""
+        self._numbers.take(self._sensor_index, out=outputs, mode="clip")
+        if self._has_matrix:
+            outputs[at.QUATERNION] = at.quaternion_of_matrix(outputs[at.MATRIX].tolist())
 
     def describe(self) -> dict[str, Any]:
         """Return the arguments of :class:`~lw_torchrl.suites.metaworld.compiled_rows.CompiledRows` for this row."""
@@ -86,6 +94,7 @@ class SimulatedRow:
             "substeps": self._substeps,
             "looks": True,
             "looks_ahead": True,
+            "has_matrix": self._has_matrix,
             "inputs_at": addresses_of(self.mocap, self._control),
             "zeros_at": [],
             "outputs_at": self._numbers.ctypes.data + self._numbers.itemsize * self._sensor_index,

@@ -108,29 +108,31 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
         if self._running is None or not np.array_equal(self._running.rows, rows):  # the running rows seldom change
             self._running = _RunningRows(self, rows)
-        running, action = self._running, action[rows]
+        running = self._running
+        every = slice(None) if len(rows) == len(action) else rows  # a slice selects without a copy
+        action = action[every]
         shift = np.minimum(np.maximum(action[:, :3], -1), 1) * self._action_scale
-        mocap = np.minimum(np.maximum(self._mocap[rows] + shift, running.mocap_low), running.mocap_high)
-        self._mocap[rows] = mocap
+        mocap = np.minimum(np.maximum(self._mocap[every] + shift, running.mocap_low), running.mocap_high)
+        self._mocap[every] = mocap
         inputs = np.concatenate((mocap, action[:, 3:] * FINGERS), axis=1)
         sensors = np.empty((len(rows), self._width))
         stable = self._simulate(rows, inputs, sensors)
 
-        current = running.observer.current(sensors)
-        goal = self._goal[rows]
-        observation = np.concatenate((current, self._current[rows], goal), axis=1)
+        current = running.observer.observe(sensors)
+        goal = self._goal[every]
+        observation = np.concatenate((current, self._current[every], goal), axis=1)
         np.clip(observation, running.low, running.high, out=observation)
-        achieved = running.success(sensors, current, goal)
+        achieved = running.success(sensors, goal)
         rewards = achieved if running.reward is None else running.reward(sensors, observation, goal, action)
         stable &= np.isfinite(observation).all(axis=1)
         if not stable.all():
             self._faulted[rows[~stable]] = True
-            rows, current, observation = rows[stable], current[stable], observation[stable]
+            every, current, observation = rows[stable], current[stable], observation[stable]
             achieved, rewards = achieved[stable], rewards[stable]
-        self._current[rows] = current
-        self._observation[rows] = observation
-        success[rows] = achieved
-        reward[rows] = rewards
+        self._current[every] = current
+        self._observation[every] = observation
+        success[every] = achieved
+        reward[every] = rewards
 
 
 class _RunningRows:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import lw_torchrl as lw
 from lw_torchrl._util import reproducibility
 from lw_torchrl.suites.engine import EngineStep
+from lw_torchrl.suites.metaworld import row_kernel
 from lw_torchrl.suites.metaworld.observation import quaternion_of_matrix, row_norm
 from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
 from lw_torchrl.suites.metaworld.simulated_rows import RowGroup, WorkerPool, split_into_groups
@@ -373,7 +374,8 @@ def test_quaternions_have_scipys_bits():
     quarters = [np.round(Rotation.from_euler("xyz", k, degrees=True).as_matrix()) for k in np.ndindex(4, 4, 4)]
     matrices = np.concatenate((random, quarters))
     one_by_one = np.stack([Rotation.from_matrix(matrix).as_quat() for matrix in matrices])
-    assert same_bits(one_by_one, quaternion_of_matrix(matrices.reshape(-1, 9))).all()
+    for convert in (quaternion_of_matrix, row_kernel.quaternion_of_matrix):
+        assert same_bits(one_by_one, np.array([convert(tuple(m.ravel().tolist())) for m in matrices])).all()
 
 
 def test_norms_have_numpys_bits():
