@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -14,9 +14,9 @@ from torchrl.envs import EnvBase
 from lw_torchrl._util.checks import Count, Scale, missing_keys, typed
 from lw_torchrl._util.devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, Rerun, null_control
-from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, Cause, Difference, Failure, Finding
-from lw_torchrl.evaluation.diagnose.replacements import EpisodeId, Scripts, own_evaluators
+from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, Cause, Difference, Failure, Misled, WrongMotion
+from lw_torchrl.evaluation.diagnose.replacements import EpisodeId, Scripts, gripper_of, own_evaluators
+from lw_torchrl.evaluation.diagnose.reruns import Rerun, Reruns
 from lw_torchrl.evaluation.diagnose.states import EpisodeStates, Explanation, explain, stall_step, states_of
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
@@ -26,9 +26,9 @@ from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.suites.suite import Suite, find_suite
 
 MARGIN = 0.3  # a clear lead of one replacement, as a fraction of the task's failed episodes
-_FACTS = ("perception", "query")  # tried only after a wrong observation or answer was recorded, which is a fact
-_WIDER = {"skill": ("gripper", "actuation", "policy"), "gripper": ("policy",), "actuation": ("policy",)}
-"""Replacements that contain another replacement, so that they fix every episode that the contained one fixes."""
+_FACTS = ("perception", "query", "wrapper")  # tried only after a wrong observation, answer or action was measured
+_PARTS = ("skill", "gripper", "actuation", "policy")  # scripts, from the smallest part of the policy to the largest
+_CLEAR = 0.1  # root mean square by which executed actions must differ from the commanded ones
 
 
 @typed
@@ -50,29 +50,30 @@ def attribute_failures(
     device: str | torch.device | None = None,
     progress: bool = True,
 ) -> list[Failure]:
-    """Find the cause of each failed episode: the observations, the answers to the plan's conditions, the plan, a skill,
-    another part of the policy, or the time limit.
+    """Find the cause of each failed episode: the environment, the observations, the answers to the plan's conditions,
+    the plan, a skill, another part of the policy, the noise, or the time limit.
 
     **A rule examines the states.** The cause is *query* if the policy acted on wrong answers; otherwise *plan* if, late
     in the episode, plan and reference plan request different actions; otherwise *skill*. The rule is not a proof: a
     plan that differs from the reference may succeed. Without a reference, the rule detects only wrong answers, a plan
     without a true condition, and a skill that stays far from its target. Without ``actor``, only the rule is used.
 
-    **Counterfactual re-runs decide**, if ``actor`` is given. First comes the null control: the episode is re-run with
-    the same noise and nothing replaced. If the re-run succeeds, the failure is *not reproducible*, and the finding
-    reports what differs. Otherwise the episode is re-run with one part replaced by a trusted one:
+    **Measurements come first**, if ``actor`` is given. Each episode is re-run with the same noise and nothing replaced.
 
-    - *perception*: the true observations, if the policy received wrong observations;
-    - *query*: the true answers, if the policy acted on wrong answers;
-    - *plan*: the reference plan;
-    - *skill*: in one plan step, the action of a scripted skill (of the expert if the plan step has no scripted skill);
-      *gripper* and *actuation*: in all plan steps, only the gripper's or the hand's part of the action; *policy*: in
-      all plan steps, the whole action;
-    - *out of time*: twice the time limit.
+    - *environment differs*: the first state, or the state after the same action, differs from the rollout's;
+    - *not reproducible*: the re-run succeeds, and the finding reports what differs;
+    - *perception*: the policy's innermost module was shown wrong observations, and succeeds with the true ones;
+    - *query*: the policy acted on wrong answers, and succeeds with the true ones;
+    - *actuation* or *gripper*: what surrounds the innermost module changed its motions or its gripper, and the episode
+      succeeds without this; or the environment executed other actions than commanded plus noise. If this happened in
+      only one plan step, the cause is *skill*.
 
-    If no replacement helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one
-    that fixes most of the task's failed episodes counts; among about equally good ones, the smallest. A skill does not
-    count if other plan steps have the same fault. For a policy without plans, no plan step is reported.
+    **Replacements decide about what is left.** Scripts take control of the whole policy. If they succeed, the plan is
+    sound, and the scripts' actions show what the policy does differently: the *gripper*, the motion in one plan step
+    (*skill*) or in all (*actuation*). Scripts for only this part must succeed too, otherwise the cause is *policy*. If
+    they fail, the reference *plan* is tried, then twice the time (*out of time*), then pairs, which give ``cause`` and
+    ``also``. No part is blamed if the episode succeeds without the noise, or with other noise, and this repairs about
+    as many of the task's failed episodes; the cause is then *noise*. Without plans, no plan step is reported.
 
     Args:
         rollouts: episodes as :func:`evaluate` passes them to ``on_episode``, or TensorDicts of batch (T,), each with
@@ -93,8 +94,8 @@ def attribute_failures(
         A :class:`Failure` for each failed episode, in the order of the rollouts.
 
     Raises:
-        ValueError: a rollout lacks a key, an episode occurs twice, a task has no plan, the plans differ from the
-            actor's plans, or an episode does not start from the initial state of (task, seed, episode).
+        ValueError: a rollout lacks a key, an episode occurs twice, a task has no plan, or the plans differ from the
+            actor's plans.
 
     Example:
         >>> import lw_torchrl as lw
@@ -108,7 +109,7 @@ def attribute_failures(
         >>> _ = lw.evaluate(actor, tasks="reach", episodes_per_task=1, **run, **record)
         >>> [failure] = attribute_failures(episodes, plans, actor=actor, **run)
         >>> failure.cause, failure.counterfactuals
-        ('skill', {'skill': True})
+        ('skill', {'no noise': False, 'other noise': False, 'policy': True, 'skill': True})
 
     Source: a plan's conditions, skills and skill execution are separate in the policy, so each can be replaced.
     """
@@ -135,13 +136,10 @@ def attribute_failures(
     env_options = {"seed": seed, "suite": own_suite, "engine": engine, "num_threads": num_threads}
     env_options["max_steps"] = own_suite.max_steps if max_steps is None else max_steps
     rerun = Rerun(tasks, env_options, noise_scale, num_envs, device, progress)
-    null = null_control(rerun, {states.which: states.steps for states in seen}, actor, answered, evaluator)
-    tried = Counterfactuals(
-        actor, evaluator, None if trusted_scripts is None else trusted_scripts.plans, scripts, rerun, null
-    )
-    tried.run(seen, [states.which for states, explanation in explained if _plans_agree(explanation)])
-    shares = tried.shares()
-    return [_by_counterfactuals(*both, tried, shares.get(both[0].task, {}), seed) for both in explained]
+    reruns = Reruns(actor, evaluator, scripts, Plans(trusted) if trusted else None, rerun, {s.which: s for s in seen})
+    reruns.run()
+    shares = reruns.shares()
+    return [_by_reruns(*both, reruns, shares[both[0].task], seed) for both in explained]
 
 
 def _failed(rollouts: Iterable[Any], plans: Plans) -> list[tuple[str, int, TensorDictBase]]:
@@ -195,101 +193,112 @@ def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
     return ["observation", "task_id", "qaf", *keys, "skill_weights", "qaf_logits"]
 
 
-def _plans_agree(explanation: Explanation) -> bool:
-    """Return whether the plan and the reference request the same actions in all states of an episode."""
-    return explanation.evidence.get("plan_departs") == 0.0
-
-
-def _by_counterfactuals(
-    seen: EpisodeStates, explanation: Explanation, tried: Counterfactuals, shares: Mapping[str, float], seed: int
+def _by_reruns(
+    seen: EpisodeStates, explanation: Explanation, reruns: Reruns, shares: Mapping[str, float], seed: int
 ) -> Failure:
-    """Return the failure with two additions: the cause found by the counterfactual re-runs and the finding from the
-    states.
-    """
-    which, null = seen.which, tried.null
-    share, number = null.share(seen.task), float(sum(task == seen.task for task, _ in null.episodes))
-    record: dict[str, Any] = {"evidence": {**explanation.evidence, "failed": number}}
-    record["shares"] = {"nothing": share, **shares}
-    if null.succeeds(which) or (which in null.differs and share >= MARGIN):
-        first = null.differs.get(which, Difference("nothing", len(seen.steps) - 1))
-        record["succeeds_at"] = null.episodes[which].first_success
-        return Failure(seen.task, seed, seen.episode, "not reproducible", None, None, first.at, first, **record)
-    tried_here = {name: results[which] is not None for name, results in tried.results.items() if which in results}
-    record["counterfactuals"] = tried_here
+    """Return the failure with the cause found by the re-runs, and the finding that shows it."""
+    which, known = seen.which, {"shares": dict(shares)}
+    number = float(sum(task == seen.task for task, _ in reruns.seen))
+    record: dict[str, Any] = known | {"evidence": {**explanation.evidence, "failed": number}}
+    differs, again = reruns.differs.get(which), reruns.plain[which].first_success
+    if reruns.fails_elsewhere(which) or (differs is not None and shares["nothing"] >= MARGIN):
+        first = differs or Difference("nothing", len(seen.steps) - 1)
+        cause: Cause = "environment differs" if reruns.environment_differs(which) else "not reproducible"
+        return Failure(seen.task, seed, seen.episode, cause, None, None, first.at, first, succeeds_at=again, **record)
+    record["counterfactuals"] = tried = {
+        name: results[which] is not None for name, results in reruns.results.items() if which in results
+    }
     # If both plans request the same actions, a success with the reference is not due to the reference's content.
-    same = _plans_agree(explanation)
-    counting = [name for name in tried.mending(seen) if not (same and name == "plan")]
-    decision = decide(counting, shares, share)
-    cause, also, mended = decision.cause, decision.also, tried.mended(decision.by, which)
-    # If the motion is wrong only in one step, the skill of that step is to blame.
-    only = tried.step_of_motion(seen) if cause == "actuation" else None
-    cause = cause if only is None else "skill"
-    if mended is not None:
-        record |= {"replaced": decision.by, "rival": decision.rival, "succeeds_at": len(mended.steps), "mended": mended}
-        if cause == "actuation" and tried_here.get("skill") and "skill" not in counting:
-            record["scripted_step"] = tried.step[which]
-    elif explanation.cause == "query" and "query" not in tried_here and not (same and tried_here.get("plan")):
+    same = explanation.evidence.get("plan_departs") == 0.0
+    mended = [name for name, success in tried.items() if success and not (same and name == "plan")]
+    cause, also, by = decide(mended, shares)
+    step, motion = reruns.step.get(which), None
+    if cause == "undecided" and which in reruns.executed and (found := _wrong_motion(reruns, which, "commanded"))[1]:
+        cause, motion = found[0], found[1]
+    elif by == "wrapper":
+        right: Literal["decided", "commanded"] = "decided" if which in reruns.wrapped else "commanded"
+        cause, motion, step = _wrong_motion(reruns, which, right)
+    elif by in ("gripper", "actuation"):
+        motion = _wrong_motion(reruns, which, "scripted", by)[1]
+    elif cause == "undecided" and explanation.cause == "query" and "query" not in tried:
         cause = "query"  # wrong answers are a fact, even if they could not be replaced
-    step: int | None
-    finding: Finding | None
-    step, at, finding = explanation.blames.get(cause, explanation.blames["undecided"])
-    if cause == "skill" and also is None:
-        step, plan = tried.step[which] if only is None else only, tried.plans[seen.task]
-        at, finding = stall_step(seen, step, plan.definition.layout), seen.active_time(plan, step)
+    if (episode := reruns.mended(by, which)) is not None:
+        record |= {"replaced": by, "succeeds_at": len(episode.steps), "mended": episode}
+    place, at, finding = explanation.blames.get(cause, explanation.blames["undecided"])
+    if cause == "skill" and also is None and step is not None:
+        plan = reruns.scripts.plans[seen.task]
+        place, at, finding = step, stall_step(seen, step, plan.definition.layout), seen.active_time(plan, step)
     elif cause == "perception":
-        finding = null.misled[which]
+        finding = reruns.misled[which]
     elif cause == "undecided" and explanation.cause != "undecided":
         record["suspect"], finding = explanation.cause, explanation.blames[explanation.cause].finding
-    if plans_of(tried.actor) is None and cause != "query":
-        step = None
-    finding = None if step is None and cause != "perception" else finding
-    return Failure(seen.task, seed, seen.episode, cause, also, step, at, finding, **record)
+    elif motion is not None:
+        finding = motion
+    planless = plans_of(reruns.actor) is None and cause != "query"
+    finding = finding if not planless or isinstance(finding, Misled | WrongMotion) else None
+    return Failure(seen.task, seed, seen.episode, cause, also, None if planless else place, at, finding, **record)
+
+
+def _wrong_motion(
+    reruns: Reruns, which: EpisodeId, right: Literal["decided", "commanded", "scripted"], by: str | None = None
+) -> tuple[Cause, WrongMotion | None, int | None]:
+    """Return the part of the action that differs from the right action, the finding, and its plan step if only one."""
+    motion = {"decided": reruns.wrapped, "commanded": reruns.executed, "scripted": reruns.scripted}[right][which]
+    gripper = gripper_of(reruns.scripts.plans)
+    hand, fingers = motion.of(~gripper), motion.of(gripper)
+    part = fingers if by == "gripper" or (by is None and fingers.error() > 4 * hand.error()) else hand
+    if part.error() < (_CLEAR if right == "commanded" else 0.0):
+        return "undecided", None, None
+    in_all, worst, shape = part.extent()
+    errors = part.errors()
+    steps = sum(error > 0.1 * max(errors.values()) for error in errors.values())
+    name: Literal["gripper", "motion"] = "gripper" if part is fingers else "motion"
+    finding = WrongMotion(name, right, shape, part.error(), steps)
+    if part is fingers:
+        return "gripper", finding, None
+    return ("skill", finding, worst) if in_all is False else ("actuation", finding, None)
 
 
 class Decision(NamedTuple):
-    """A failure's cause, a second cause, the deciding replacement (``by``), and the next best one (``rival``)."""
+    """A failure's cause, a second cause, and the deciding replacement (``by``)."""
 
     cause: Cause
     also: Cause | None = None
     by: str | None = None
-    rival: str | None = None
 
 
-def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0.0) -> Decision:
+def decide(mended: Collection[str], shares: Mapping[str, float]) -> Decision:
     """Decide the cause of a failed episode from the replacements with which the episode succeeds (``mended``).
 
-    ``shares`` is, for each replacement, the fraction of the task's failed episodes it was tried on that it fixes;
-    ``null`` is that fraction for a plain re-run.
+    ``shares`` is, for each replacement, the fraction of the task's failed episodes it was tried on that it fixes, and
+    for "nothing" the fraction that a plain re-run fixes.
 
-    Wrong observations and answers come first, if correcting them helps. Among the other replacements, the one that
-    fixes most of the task's failed episodes counts. Among about equally good ones, the first in this order counts: the
-    plan, unless scripts that follow the plan succeed; a skill in one plan step; the gripper or the motion. The cause is
-    the policy as a whole if two replacements that do not contain each other are about equally good, or if none is
-    clearly better than a plain re-run. The time limit comes last, then pairs.
+    Measured errors come first, if correcting them helps. Then comes the smallest part of the policy whose replacement
+    by scripts helps: a skill in one plan step, the gripper or the motion (of these two, the one that fixes more).
+    Scripts for the whole policy show that the plan is sound, but not which part is to blame. The plan comes next. A
+    part counts only if it fixes clearly more of the task's failed episodes than a plain re-run or a change of noise.
     """
-    single = {name: causes[0] for name, causes in REPLACEMENTS.items() if len(causes) == 1}
-    fixes = {name: shares.get(name, 1.0) for name in single if name in mended}
-    time = fixes.pop("time", None)
-    if not fixes:
-        if time is not None:
-            return Decision("out of time", by="time")
-        pair = choose_pair(mended, shares)
-        return Decision("undecided") if pair is None else Decision(*pair)
-    if "policy" in fixes and any(name in fixes for name in ("skill", "gripper", "actuation")):
-        fixes.pop("plan", None)  # the plan is sound, because scripts that follow it succeed
-    best = next(iter(fixes))
-    if facts := [name for name in fixes if name in _FACTS]:
+    fixes = {name: shares.get(name, 1.0) for name in mended}
+    if facts := [name for name in _FACTS if name in fixes]:
         best = max(facts, key=fixes.__getitem__)
-    else:
-        for name, share in fixes.items():
-            if share >= fixes[best] + MARGIN:
-                best = name
-    rivals = {name: share for name, share in fixes.items() if name != best and name not in _WIDER.get(best, ())}
-    rival = max(rivals, key=rivals.__getitem__, default=None)
-    close = rival is not None and best not in _FACTS and best != "plan" and rivals[rival] > fixes[best] - MARGIN
-    if fixes[best] < null + MARGIN or (close and best != "policy"):
-        return Decision("policy", by=best, rival=rival)
-    return Decision(single[best], by=best, rival=rival)
+        return Decision(REPLACEMENTS[best][0], by=best)
+    chance = max((name for name in ("no noise", "other noise") if name in fixes), key=fixes.__getitem__, default=None)
+    parts = [name for name in _PARTS if name in fixes] or [name for name in ("plan",) if name in fixes]
+    if parts:
+        best = parts[0]
+        if "gripper" in fixes and "actuation" in fixes and best != "skill":
+            best = max(("gripper", "actuation"), key=fixes.__getitem__)
+            if abs(fixes["gripper"] - fixes["actuation"]) < MARGIN:
+                return Decision("policy", by=best)
+        if chance is None or fixes[best] >= fixes[chance] + MARGIN:
+            clear = fixes[best] >= shares.get("nothing", 0.0) + MARGIN
+            return Decision(REPLACEMENTS[best][0] if clear else "policy", by=best)
+    if chance is not None:
+        return Decision("noise", by=chance)
+    if "time" in fixes:
+        return Decision("out of time", by="time")
+    pair = choose_pair(mended, shares)
+    return Decision("undecided") if pair is None else Decision(*pair)
 
 
 def choose_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tuple[Cause, Cause, str] | None:
