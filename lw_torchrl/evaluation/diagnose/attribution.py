@@ -26,8 +26,14 @@ from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.suites.suite import Suite, find_suite
 
 MARGIN = 0.3  # a clear lead of one replacement, as a fraction of the task's failed episodes
-_FACTS = ("perception", "query", "wrapper")  # tried only after a wrong observation, answer or action was measured
+_FACTS = (
+    "environment",
+    "perception",
+    "query",
+    "wrapper",
+)  # tried only after a wrong observation, answer or action was measured
 _PARTS = ("skill", "gripper", "actuation", "policy")  # scripts, from the smallest part of the policy to the largest
+_SEEN = 0.01  # meters by which an observation must be wrong to count if correcting it does not help
 _CLEAR = 0.1  # root mean square by which executed actions must differ from the commanded ones
 
 
@@ -213,15 +219,18 @@ def _by_reruns(
     mended = [name for name, success in tried.items() if success and not (same and name == "plan")]
     cause, also, by = decide(mended, shares)
     step, motion = reruns.step.get(which), None
-    if cause == "undecided" and which in reruns.executed and (found := _wrong_motion(reruns, which, "commanded"))[1]:
-        cause, motion = found[0], found[1]
-    elif by == "wrapper":
-        right: Literal["decided", "commanded"] = "decided" if which in reruns.wrapped else "commanded"
-        cause, motion, step = _wrong_motion(reruns, which, right)
+    # Changed actions are a fact, so they are to blame even if the episode also fails without the change.
+    found = _wrong_motion(reruns, which, "decided", by), _wrong_motion(reruns, which, "commanded", by)
+    measured = [each for each in found if each[1] is not None]
+    if measured and by not in ("environment", "perception", "query"):
+        cause, motion, step = max(measured, key=lambda each: each[1].error if each[1] else 0.0)
+        by, also = "wrapper" if by == "wrapper" else None, None
     elif by in ("gripper", "actuation"):
         motion = _wrong_motion(reruns, which, "scripted", by)[1]
     elif cause == "undecided" and explanation.cause == "query" and "query" not in tried:
         cause = "query"  # wrong answers are a fact, even if they could not be replaced
+    elif cause == "undecided" and which in reruns.misled and reruns.misled[which].error > _SEEN:
+        cause = "perception"
     if (episode := reruns.mended(by, which)) is not None:
         record |= {"replaced": by, "succeeds_at": len(episode.steps), "mended": episode}
     place, at, finding = explanation.blames.get(cause, explanation.blames["undecided"])
@@ -243,11 +252,13 @@ def _wrong_motion(
     reruns: Reruns, which: EpisodeId, right: Literal["decided", "commanded", "scripted"], by: str | None = None
 ) -> tuple[Cause, WrongMotion | None, int | None]:
     """Return the part of the action that differs from the right action, the finding, and its plan step if only one."""
-    motion = {"decided": reruns.wrapped, "commanded": reruns.executed, "scripted": reruns.scripted}[right][which]
+    compared = {"decided": reruns.wrapped, "commanded": reruns.executed, "scripted": reruns.scripted}[right]
+    if (motion := compared.get(which)) is None:
+        return "undecided", None, None
     gripper = gripper_of(reruns.scripts.plans)
     hand, fingers = motion.of(~gripper), motion.of(gripper)
-    part = fingers if by == "gripper" or (by is None and fingers.error() > 4 * hand.error()) else hand
-    if part.error() < (_CLEAR if right == "commanded" else 0.0):
+    part = fingers if by == "gripper" or (by != "actuation" and fingers.error() > 4 * hand.error()) else hand
+    if part.error() < (0.0 if by == "wrapper" or right == "scripted" else _CLEAR):
         return "undecided", None, None
     in_all, worst, shape = part.extent()
     errors = part.errors()

@@ -16,7 +16,7 @@ Blamed = Literal["perception", "query", "plan", "skill", "gripper", "actuation",
 Cause = Literal["environment differs", "not reproducible", Blamed, "noise", "out of time", "undecided"]
 
 CAUSES: dict[str, str] = {
-    "environment differs": "the environment of the rollout differs from that of the re-run",
+    "environment differs": "the environment differs from that of the re-run, or from the suite's",
     "not reproducible": "a plain re-run succeeds",
     "perception": "the policy received a wrong observation",
     "query": "a condition was answered wrongly",
@@ -32,6 +32,7 @@ CAUSES: dict[str, str] = {
 """A mapping from each cause to its meaning."""
 
 REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
+    "environment": ("environment differs",),
     "perception": ("perception",),
     "query": ("query",),
     "wrapper": ("actuation",),

@@ -142,6 +142,7 @@ class Control(nn.Module):
         self._calls: list[tuple[Tensor, Tensor]] = []  # what innermost modules were shown and decided
         self._true: Tensor | None = None
         self._shown = torch.empty(0)
+        self._inside: list[nn.Module] = []  # the innermost module while it runs
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         true, observation, task = (tensordict.get(key).clone() for key in (TRUE_OBSERVATION, "observation", "task_id"))
@@ -153,7 +154,7 @@ class Control(nn.Module):
         try:
             tensordict = self.actor(tensordict)
         finally:
-            self._true = None
+            self._true, self._inside = None, []
             for hook in hooks:
                 hook.remove()
         action = tensordict.get("action")
@@ -195,25 +196,27 @@ class Control(nn.Module):
         return weights, scripted.masked_fill(unscripted.unsqueeze(-1), torch.nan), step
 
     def _watched(self, module: nn.Module, tensordict: Any) -> bool:
-        """Return whether a module is innermost in the policy: it acts, and contains no other module that acts."""
+        """Return whether a module is a whole policy: it acts, and it is our own or contains no other one that acts."""
         if self._true is None or not isinstance(tensordict, TensorDictBase):
             return False
         if module not in self._innermost:
-            inner = [part for part in module.modules() if part is not module]
+            inner = [] if type(module).__module__.startswith("lw_torchrl.") else [*module.modules()][1:]
             self._innermost[module] = _acts(module) and not any(map(_acts, inner))
-        shown = tensordict.get("observation", None)
-        return self._innermost[module] and shown is not None and shown.shape == self._true.shape
+        shown = tensordict.get("observation", None) if self._innermost[module] else None
+        return shown is not None and shown.shape == self._true.shape
 
     def _correct(self, module: nn.Module, args: tuple[Any, ...]) -> None:
-        if args and self._watched(module, args[0]):
+        if not self._inside and args and self._watched(module, args[0]):
             assert self._true is not None
-            self._shown = args[0].get("observation").clone()
+            self._inside, self._shown = [module], args[0].get("observation").clone()
             if self.correct:
                 args[0].set("observation", self._true.clone())
 
     def _look(self, module: nn.Module, args: tuple[Any, ...], output: Any) -> None:
-        if args and self._watched(module, args[0]) and isinstance(output, TensorDictBase):
-            self._calls.append((self._shown, output.get("action").clone()))
+        if self._inside and module is self._inside[0]:
+            self._inside = []
+            if isinstance(output, TensorDictBase):
+                self._calls.append((self._shown, output.get("action").clone()))
 
 
 def gripper_of(plans: Plans) -> Tensor:

@@ -65,12 +65,13 @@ class Rerun:
         evaluator: Any = None,
         longer: int = 1,
         noise: float | None = None,
+        engine: Any = ...,
         **control: Any,
     ) -> dict[EpisodeId, FinishedEpisode]:
         """Re-run episodes, each up to its first success, with ``longer`` times the original time limit.
 
-        ``noise`` is the standard deviation of the noise, None for the original one; ``control`` goes to
-        :class:`Control`.
+        ``noise`` is the standard deviation of the noise, None for the original one; ``engine`` replaces the original
+        engine; ``control`` goes to :class:`Control`.
         """
         listed = {task: [k for _, k in group] for task, group in groupby(sorted(which), itemgetter(0))}
         episodes: dict[EpisodeId, FinishedEpisode] = {}
@@ -87,7 +88,8 @@ class Rerun:
             plans=scripts.plans,
             evaluator=evaluator,
             num_envs=None if self.num_envs is None else max(len(listed), self.num_envs),
-            env_options={**self.env_options, "max_steps": self.env_options["max_steps"] * longer},
+            env_options={**self.env_options, "max_steps": self.env_options["max_steps"] * longer}
+            | ({} if engine is ... else {"engine": engine}),
             keys=[*_KEYS, *_MEASURED],
             optional=["qaf", "skill_weights"],
             noise_scale=self.noise_scale if noise is None else noise,
@@ -154,6 +156,10 @@ class Reruns:
         for which, states in self.seen.items():
             self._measure(which, states, self.plain[which].steps)
         every = [which for which in every if not self.fails_elsewhere(which)]
+        own = set(self.rerun.env_options["suite"].tasks)
+        if callable(self.rerun.env_options["engine"]):
+            self._try("environment", [w for w in every if w[0] in own], engine=None)
+            every = self._unfixed(every, "environment")
         is_sensor = isinstance(self.evaluator, Transform) and "observation" in self.evaluator.out_keys
         evaluator, true = None if is_sensor else self.evaluator, with_true_answers(self.actor)
         self._try("perception", [w for w in every if w in self.misled], evaluator=evaluator, correct=True)

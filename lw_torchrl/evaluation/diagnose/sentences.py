@@ -16,6 +16,7 @@ from lw_torchrl.evaluation.diagnose.failure import (
 )
 
 _TEXTS = {
+    "environment": ("the suite's own engine", "the engine"),
     "perception": ("the true observations", "the observations"),
     "query": ("the true answers", "the answers"),
     "plan": ("the reference plan", "the plan"),
