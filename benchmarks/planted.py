@@ -261,7 +261,7 @@ class Delayed:
         action, seen = written.get("action").clone(), written.get("observation")
         first = (seen[:, :18] == seen[:, 18:36]).all(-1)  # at a reset, the previous state is the present one
         rows = zip(written.get("task_id").tolist(), written.get("episode").tolist(), strict=True)
-        for row, which in {which: row for row, which in enumerate(rows)}.items():
+        for which, row in {which: row for row, which in enumerate(rows)}.items():
             past = self._past[which] = [] if which not in self._past or first[row] else self._past[which]
             past.append(action[row].clone())
             action[row, self.entries] = past[max(0, len(past) - 1 - self.steps)][self.entries]

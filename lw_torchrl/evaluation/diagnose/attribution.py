@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -32,7 +32,7 @@ _FACTS = (
     "query",
     "wrapper",
 )  # tried only after a wrong observation, answer or action was measured
-_PARTS = ("skill", "gripper", "actuation", "policy")  # scripts, from the smallest part of the policy to the largest
+_PARTS = ("skill", "gripper", "actuation", "policy", "plan")  # in the order in which they count
 _SEEN = 0.01  # meters by which an observation must be wrong to count if correcting it does not help
 _CLEAR = 0.1  # root mean square by which executed actions must differ from the commanded ones
 
@@ -59,27 +59,25 @@ def attribute_failures(
     """Find the cause of each failed episode: the environment, the observations, the answers to the plan's conditions,
     the plan, a skill, another part of the policy, the noise, or the time limit.
 
-    **A rule examines the states.** The cause is *query* if the policy acted on wrong answers; otherwise *plan* if, late
-    in the episode, plan and reference plan request different actions; otherwise *skill*. The rule is not a proof: a
-    plan that differs from the reference may succeed. Without a reference, the rule detects only wrong answers, a plan
-    without a true condition, and a skill that stays far from its target. Without ``actor``, only the rule is used.
+    Without ``actor``, a rule examines the states: the cause is *query* if the policy acted on wrong answers; *plan* if,
+    late in the episode, plan and reference request different actions, or no condition holds; otherwise *skill*.
 
-    **Measurements come first**, if ``actor`` is given. Each episode is re-run with the same noise and nothing replaced.
+    With ``actor``, **measurements come first**. Each episode is re-run with the same noise and nothing replaced.
 
-    - *environment differs*: the first state, or the state after the same action, differs from the rollout's;
+    - *environment differs*: the first state, or the state after the same action, differs from the rollout's, or the
+      episode succeeds in the suite's own engine;
     - *not reproducible*: the re-run succeeds, and the finding reports what differs;
-    - *perception*: the policy's innermost module was shown wrong observations, and succeeds with the true ones;
-    - *query*: the policy acted on wrong answers, and succeeds with the true ones;
-    - *actuation* or *gripper*: what surrounds the innermost module changed its motions or its gripper, and the episode
-      succeeds without this; or the environment executed other actions than commanded plus noise. If this happened in
-      only one plan step, the cause is *skill*.
+    - *perception*: the policy was shown wrong observations; *query*: it acted on wrong answers; and it succeeds with
+      the true ones;
+    - *actuation* or *gripper*: something around the policy or the environment changed the motion or the gripper's
+      command, beyond the noise. If this happened in only one plan step, the cause is *skill*.
 
     **Replacements decide about what is left.** Scripts take control of the whole policy. If they succeed, the plan is
     sound, and the scripts' actions show what the policy does differently: the *gripper*, the motion in one plan step
     (*skill*) or in all (*actuation*). Scripts for only this part must succeed too, otherwise the cause is *policy*. If
     they fail, the reference *plan* is tried, then twice the time (*out of time*), then pairs, which give ``cause`` and
-    ``also``. No part is blamed if the episode succeeds without the noise, or with other noise, and this repairs about
-    as many of the task's failed episodes; the cause is then *noise*. Without plans, no plan step is reported.
+    ``also``. If the episode succeeds without noise, and this repairs about as many of the task's failed episodes as
+    the best replacement, no part is blamed, but the *noise*.
 
     Args:
         rollouts: episodes as :func:`evaluate` passes them to ``on_episode``, or TensorDicts of batch (T,), each with
@@ -115,7 +113,7 @@ def attribute_failures(
         >>> _ = lw.evaluate(actor, tasks="reach", episodes_per_task=1, **run, **record)
         >>> [failure] = attribute_failures(episodes, plans, actor=actor, **run)
         >>> failure.cause, failure.counterfactuals
-        ('skill', {'no noise': False, 'other noise': False, 'policy': True, 'skill': True})
+        ('skill', {'no noise': False, 'policy': True, 'skill': True})
 
     Source: a plan's conditions, skills and skill execution are separate in the policy, so each can be replaced.
     """
@@ -260,7 +258,7 @@ def _wrong_motion(
     part = fingers if by == "gripper" or (by != "actuation" and fingers.error() > 4 * hand.error()) else hand
     if part.error() < (0.0 if by == "wrapper" or right == "scripted" else _CLEAR):
         return "undecided", None, None
-    in_all, worst, shape = part.extent()
+    in_all, worst, shape = part.extent(exact=right != "scripted")
     errors = part.errors()
     steps = sum(error > 0.1 * max(errors.values()) for error in errors.values())
     name: Literal["gripper", "motion"] = "gripper" if part is fingers else "motion"
@@ -270,59 +268,32 @@ def _wrong_motion(
     return ("skill", finding, worst) if in_all is False else ("actuation", finding, None)
 
 
-class Decision(NamedTuple):
-    """A failure's cause, a second cause, and the deciding replacement (``by``)."""
-
-    cause: Cause
-    also: Cause | None = None
-    by: str | None = None
-
-
-def decide(mended: Collection[str], shares: Mapping[str, float]) -> Decision:
+def decide(mended: Collection[str], shares: Mapping[str, float]) -> tuple[Cause, Cause | None, str | None]:
     """Decide the cause of a failed episode from the replacements with which the episode succeeds (``mended``).
 
     ``shares`` is, for each replacement, the fraction of the task's failed episodes it was tried on that it fixes, and
-    for "nothing" the fraction that a plain re-run fixes.
+    for "nothing" the fraction that a plain re-run fixes. Return a cause, a second cause, and the deciding replacement.
 
     Measured errors come first, if correcting them helps. Then comes the smallest part of the policy whose replacement
     by scripts helps: a skill in one plan step, the gripper or the motion (of these two, the one that fixes more).
     Scripts for the whole policy show that the plan is sound, but not which part is to blame. The plan comes next. A
-    part counts only if it fixes clearly more of the task's failed episodes than a plain re-run or a change of noise.
+    part counts only if it fixes clearly more of the task's failed episodes than a re-run with nothing replaced, and
+    than a re-run without noise.
     """
     fixes = {name: shares.get(name, 1.0) for name in mended}
     if facts := [name for name in _FACTS if name in fixes]:
         best = max(facts, key=fixes.__getitem__)
-        return Decision(REPLACEMENTS[best][0], by=best)
-    chance = max((name for name in ("no noise", "other noise") if name in fixes), key=fixes.__getitem__, default=None)
-    parts = [name for name in _PARTS if name in fixes] or [name for name in ("plan",) if name in fixes]
-    if parts:
-        best = parts[0]
-        if "gripper" in fixes and "actuation" in fixes and best != "skill":
+        return REPLACEMENTS[best][0], None, best
+    if best := next((name for name in _PARTS if name in fixes), ""):
+        if best == "gripper" and "actuation" in fixes:
             best = max(("gripper", "actuation"), key=fixes.__getitem__)
             if abs(fixes["gripper"] - fixes["actuation"]) < MARGIN:
-                return Decision("policy", by=best)
-        if chance is None or fixes[best] >= fixes[chance] + MARGIN:
+                return "policy", None, best
+        if fixes[best] >= fixes.get("no noise", -1.0) + MARGIN:
             clear = fixes[best] >= shares.get("nothing", 0.0) + MARGIN
-            return Decision(REPLACEMENTS[best][0] if clear else "policy", by=best)
-    if chance is not None:
-        return Decision("noise", by=chance)
-    if "time" in fixes:
-        return Decision("out of time", by="time")
-    pair = choose_pair(mended, shares)
-    return Decision("undecided") if pair is None else Decision(*pair)
-
-
-def choose_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tuple[Cause, Cause, str] | None:
-    """Return the pair of causes that counts, and the replacement that fixes both; None if no pair helps.
-
-    Wrong answers come first, then the cause whose replacement fixes more episodes on its own.
-    """
-    alone = {**shares, "skill": max(shares.get("skill", 0.0), shares.get("policy", 0.0))}
-    pairs = [name for name in mended if len(REPLACEMENTS[name]) > 1]
-    if not pairs:
-        return None
-    by = max(pairs, key=lambda name: sum(alone.get(cause, 0.0) for cause in REPLACEMENTS[name]))
-    cause, also = REPLACEMENTS[by]
-    if cause != "query" and alone.get(also, 0.0) > alone.get(cause, 0.0):
-        cause, also = also, cause
-    return cause, also, by
+            return REPLACEMENTS[best][0] if clear else "policy", None, best
+    for name in ("no noise", "time"):
+        if name in fixes:
+            return REPLACEMENTS[name][0], None, name
+    pair = next((name for name in mended if len(REPLACEMENTS[name]) > 1), None)
+    return ("undecided", None, None) if pair is None else (*REPLACEMENTS[pair], pair)

@@ -42,7 +42,6 @@ REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
     "actuation": ("actuation",),
     "policy": ("policy",),
     "no noise": ("noise",),
-    "other noise": ("noise",),
     "time": ("out of time",),
     "query + skill": ("query", "skill"),
     "query + plan": ("query", "plan"),

@@ -112,7 +112,6 @@ class Control(nn.Module):
         part: the part of the action that scripts take over: "motion", "gripper" or "all"; None for no part. If no plan
             step is active, the policy's own action is kept. If the active step has no scripted skill, the expert acts.
         steps: for each (task, episode), the only plan step in which scripts take over; None for all plan steps.
-        added: standard deviation of noise that is added, independent of the environment's noise.
     """
 
     def __init__(
@@ -123,10 +122,9 @@ class Control(nn.Module):
         unwrap: bool = False,
         part: str | None = None,
         steps: Mapping[EpisodeId, int] | None = None,
-        added: float = 0.0,
     ) -> None:
         super().__init__()
-        self.actor, self.scripts, self.correct, self.unwrap, self.added = actor, scripts, correct, unwrap, added
+        self.actor, self.scripts, self.correct, self.unwrap = actor, scripts, correct, unwrap
         self.row_by_row = bool(getattr(actor, "row_by_row", False))
         plans = scripts.plans
         self._tables = PlanTables(plans)
@@ -175,10 +173,7 @@ class Control(nn.Module):
             expert = self._expert(seen.set("_step", unknown).cpu()).get("action").to(action.device)
             scripted = torch.where(unknown.unsqueeze(-1), expert, scripted)
         taken = (replaced & ~scripted.isnan().any(-1)).unsqueeze(-1) & self._taken.to(action.device)
-        action = torch.where(taken, scripted, decided if self.unwrap else action)
-        if self.added:
-            action = (action + self.added * _hashed_noise(true, action.shape[-1])).clamp(-1.0, 1.0)
-        return tensordict.set("action", action)
+        return tensordict.set("action", torch.where(taken, scripted, decided if self.unwrap else action))
 
     def _script(self, written: TensorDictBase, observation: Tensor, task: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the weights (B, S) of the plan steps, the scripts' action (B, A), and the active plan step (B,)."""
@@ -228,11 +223,3 @@ def gripper_of(plans: Plans) -> Tensor:
 def _acts(module: nn.Module) -> bool:
     """Return whether a module maps an observation to an action."""
     return "observation" in getattr(module, "in_keys", ()) and "action" in getattr(module, "out_keys", ())
-
-
-def _hashed_noise(observation: Tensor, size: int) -> Tensor:
-    """Return standard normal noise (B, size) that depends on the observation (B, D) alone, without any state."""
-    angles = torch.arange(1, observation.shape[-1] * size + 1, dtype=torch.float64).sqrt().view(-1, size)
-    hashed = (observation.double().cpu() @ (1e4 * angles)).sin().mul(43758.5453).frac().abs()
-    noise = 2.0**0.5 * torch.erfinv((2.0 * hashed - 1.0).clamp(-0.9999, 0.9999))
-    return noise.to(observation)

@@ -173,15 +173,14 @@ class Reruns:
             if which in self.wrapped:
                 self.wrapped[which] = self.wrapped[which].and_also(self._motion(which, episode.steps)[0])
         left = self._unfixed(every, "perception", "query", "wrapper")
-        if scale := self.rerun.noise_scale:
+        if self.rerun.noise_scale:
             self._try("no noise", left, noise=0.0)
-            self._try("other noise", left, noise=0.0, added=scale)
         self._try_scripts(left)
         left = self._unfixed(left, "skill", "gripper", "actuation", "policy")
         trusted, other_actor, other_evaluator = self.trusted
         with_reference = [w for w in left if trusted is not None and w[0] in trusted.plans]
         self._try("plan", with_reference, other_actor, trusted, other_evaluator)
-        left = self._unfixed(left, "plan", "no noise", "other noise")
+        left = self._unfixed(left, "plan", "no noise")
         self._try("time", left, longer=2)
         # Try pairs only on the episodes that no single replacement fixes.
         left = self._unfixed(left, "time")

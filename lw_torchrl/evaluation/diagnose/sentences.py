@@ -26,8 +26,7 @@ _TEXTS = {
     "actuation": ("the hand's motion under scripted control", "the hand's motion"),
     "policy": ("scripted skills in every step", "all actions"),
     "no noise": ("no noise", "the noise"),
-    "other noise": ("other noise", "the noise by other noise"),
-    "out of time": ("twice the time", "the time limit"),
+    "time": ("twice the time", "the time limit"),
 }
 """A mapping from each cause to the part that its replacement inserts, and the part that is removed."""
 _IN_PAIRS = _TEXTS | {"skill": ("scripted skills", "all actions")}
@@ -35,19 +34,16 @@ _IN_PAIRS = _TEXTS | {"skill": ("scripted skills", "all actions")}
 
 def replacement_text(name: str) -> str:
     """Return the parts that a replacement inserts, for example "the true answers and scripted skills"."""
-    return " and ".join(new for new, _ in _texts(name))
+    return " and ".join(_texts(name, 0))
 
 
 def replaced_text(name: str) -> str:
     """Return the parts that a replacement removes, for example "the answers and all actions"."""
-    return " and ".join(old for _, old in _texts(name))
+    return " and ".join(_texts(name, 1))
 
 
-def _texts(name: str) -> list[tuple[str, str]]:
-    causes = REPLACEMENTS[name]
-    if name in _TEXTS:
-        return [_TEXTS[name]]
-    return [(_IN_PAIRS if len(causes) > 1 else _TEXTS)[cause] for cause in causes]
+def _texts(name: str, number: int) -> list[str]:
+    return [_TEXTS[name][number]] if name in _TEXTS else [_IN_PAIRS[cause][number] for cause in REPLACEMENTS[name]]
 
 
 def explain_failure(failure: Failure) -> str:
@@ -89,8 +85,8 @@ def _success_text(failure: Failure) -> str:
     share = failure.shares.get
     text = f"with {replacement_text(failure.replaced)} the same episode succeeds, at t = {failure.succeeds_at}"
     shares = [f"this fixes {share(failure.replaced, 1.0):.0%} of the task's failed episodes"]
-    rivals = [name for name in ("no noise", "other noise") if name in failure.shares and name != failure.replaced]
-    shares += [f"{replacement_text(name)} {share(name, 1.0):.0%}" for name in rivals]
+    if "no noise" in failure.shares and failure.replaced != "no noise":
+        shares.append(f"a re-run without noise {share('no noise', 0.0):.0%}")
     shares.append(f"a plain re-run {share('nothing', 0.0):.0%}")
     return f"{text}; {', '.join(shares)}"
 
