@@ -25,9 +25,7 @@ def __getattr__(name: str) -> object:
         found = globals()[name] = getattr(import_module(_ROOM_OF[name]), name)
         return found
     verb = name.partition("_")[0]
-    similar = [
-        known for known in __all__ if known.partition("_")[0] == verb
-    ]
+    similar = [known for known in __all__ if known.partition("_")[0] == verb]
     hint = f"; similar names: {', '.join(similar)}" if similar else ""
     raise AttributeError(f"module 'lw_torchrl' has no attribute {name!r}{hint}")
 

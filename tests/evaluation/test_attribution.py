@@ -266,7 +266,7 @@ def test_an_evaluator_inside_a_policy_is_replaced_by_exact_answers():
     assert true is not actor
     assert len(own_evaluators(true)) == len(own_evaluators(actor)) == 1
     assert isinstance(actor[0], WrongEvaluator)
-    state = rollout().exclude("next")
+    state = lw.QAFTransform(PLANS)(rollout().exclude("next"))
     exact = lw.PlanConditionedActor(PLANS)(lw.QAFTransform(PLANS)(state.copy()))["skill_weights"]
     assert torch.allclose(true(state.copy())["skill_weights"], exact)
     assert not torch.allclose(actor(state.copy())["skill_weights"], exact)
@@ -403,11 +403,6 @@ def rollout(steps=3, **changed):
 def test_wrong_rollouts_are_refused(rollouts, message):
     with pytest.raises(ValueError, match=message):
         attribute_failures(rollouts, PLANS, seed=0)
-
-
-def test_an_episode_of_another_seed_is_refused():
-    with pytest.raises(ValueError, match=r"rollouts: .* episode 0 of 'drawer-open' .* seed=0"):
-        attribute_failures([rollout()], PLANS, actor=faulty_skill(), seed=0, max_steps=5, progress=False)
 
 
 def test_arguments_that_do_not_fit_together_are_refused():

@@ -14,7 +14,15 @@ from torchrl.envs import EnvBase
 from lw_torchrl._util.checks import Count, Scale, missing_keys, typed
 from lw_torchrl._util.devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, Cause, Difference, Failure, Misled, WrongMotion
+from lw_torchrl.evaluation.diagnose.failure import (
+    REPLACEMENTS,
+    Cause,
+    Difference,
+    Failure,
+    Finding,
+    Misled,
+    WrongMotion,
+)
 from lw_torchrl.evaluation.diagnose.replacements import EpisodeId, Scripts, gripper_of, own_evaluators
 from lw_torchrl.evaluation.diagnose.reruns import Rerun, Reruns
 from lw_torchrl.evaluation.diagnose.states import EpisodeStates, Explanation, explain, stall_step, states_of
@@ -231,6 +239,7 @@ def _by_reruns(
         cause = "perception"
     if (episode := reruns.mended(by, which)) is not None:
         record |= {"replaced": by, "succeeds_at": len(episode.steps), "mended": episode}
+    finding: Finding | None
     place, at, finding = explanation.blames.get(cause, explanation.blames["undecided"])
     if cause == "skill" and also is None and step is not None:
         plan = reruns.scripts.plans[seen.task]
@@ -296,4 +305,4 @@ def decide(mended: Collection[str], shares: Mapping[str, float]) -> tuple[Cause,
         if name in fixes:
             return REPLACEMENTS[name][0], None, name
     pair = next((name for name in mended if len(REPLACEMENTS[name]) > 1), None)
-    return ("undecided", None, None) if pair is None else (*REPLACEMENTS[pair], pair)
+    return ("undecided", None, None) if pair is None else (REPLACEMENTS[pair][0], REPLACEMENTS[pair][1], pair)

@@ -74,7 +74,7 @@ class Motion(NamedTuple):
         faults["turned"] = ones @ linear
         left = {name: _rms(done - fault, where) for name, fault in faults.items()}
         best = min(left.values())
-        name = next(name for name in left if left[name] <= 1.1 * best + 0.25 * _SAME)
+        name = next(name for name in left if left[name] <= 1.25 * best + 0.25 * _SAME)
         return name if left[name] < _HALF * _rms(done - wanted, where) else "irregular", faults[name]
 
     def extent(self, exact: bool = False) -> tuple[bool | None, int, str]:
