@@ -31,8 +31,6 @@ BUILT_ON = (
 """Tasks on which causes and margins were chosen."""
 TASKS = ("pick-place", "coffee-pull", "window-open", "faucet-open", "dial-turn")
 RECORDED = ("observation", "task_id", "qaf", "skill_weights")
-HARMLESS = ("not reproducible", "perception", "policy", "undecided")
-"""Causes that blame neither the policy nor its plan nor its answers."""
 
 
 @dataclass
@@ -46,8 +44,12 @@ class Cast:
     shown: Shown | None = None
     done: Done | None = None
     evaluator: Any = None
-    simulator: Transform | None = None  # between the policy and the environment, which attribution is not told of
+    simulator: Transform | None = None  # between the policy and the environment
+    engine: Any = None  # the simulator of the episodes
+    told: bool = True  # whether attribution is told of the two
+    hidden: bool = False  # whether hooks on modules do not see what is done
     noise: float = 0.1
+    told_noise: float | None = None  # None for the right one
     told_steps: int | None = None  # what attribution is given of each episode
 
     def steps(self, step: int) -> dict[str, int]:
@@ -61,7 +63,7 @@ class Cast:
         actor = (
             lw.ScriptedSkillActor(self.plans, skills=self.skills) if self.scripted else learned.with_plans(self.plans)
         )
-        return actor if self.shown is None and self.done is None else Altered(actor, self.shown, self.done)
+        return actor if self.shown is None and self.done is None else Altered(actor, self.shown, self.done, self.hidden)
 
 
 _ENOUGH, _MOST_TURNS = 12, 3
@@ -116,69 +118,74 @@ def both(*plants: Plant) -> Plant:
 
 
 class Fault(NamedTuple):
-    """What is planted, and the causes that are right: in the list, outside of it, two at once, or other faults of the
-    motion, in one step or in all."""
+    """What is planted, and the causes that are right."""
 
     kind: str
     causes: tuple[str, ...]
     plant: Plant
 
 
-INSIDE: dict[str, Fault] = {
-    "wrong condition": Fault("inside", ("plan",), in_plan(planted.denied)),
-    "missing step": Fault("inside", ("plan",), in_plan(planted.without)),
-    "exchanged skills": Fault("inside", ("plan",), in_plan(planted.swapped)),
-    "a step too many": Fault("inside", ("plan",), in_plan(planted.with_extra)),
-    "a skill 10 cm off": Fault("inside", ("skill",), offset_skill),
-    "a skill without force": Fault("inside", ("skill",), in_skill(planted.scaled(0.05, 0.05, 0.05, 1.0))),
-    "a skill to the wrong side": Fault("inside", ("skill",), in_skill(planted.scaled(-1.0, 1.0, 1.0, 1.0))),
-    "opposite answers": Fault("inside", ("query",), lie()),
-    "answers always no": Fault("inside", ("query",), lie(never=True)),
-    "random answers": Fault("inside", ("query",), flipped),
-    "gripper stays open": Fault("inside", ("gripper",), setting(done=planted.fingers(-1.0))),
-    "gripper reversed": Fault("inside", ("gripper",), setting(done=planted.scaled(1.0, 1.0, 1.0, -1.0))),
-    "hand hardly rises or sinks": Fault("inside", ("actuation",), setting(done=planted.scaled(1.0, 1.0, 0.05, 1.0))),
-    "hand mirrored": Fault("inside", ("actuation",), setting(done=planted.scaled(-1.0, 1.0, 1.0, 1.0))),
+_PARTS = ("perception", "query", "plan", "skill", "gripper", "actuation")
+_HAND, _GRIPPER = ("actuation",), ("gripper",)
+_ELSEWHERE = ("environment differs", "not reproducible")
+
+
+def done(change: Any, hidden: bool = False) -> Plant:
+    return setting(done=change, hidden=hidden)
+
+
+def simulated(*factors: float, **change: Any) -> Plant:
+    return setting(simulator=planted.Jammed(*factors, **change))
+
+
+def physics(change: Callable[[Any], None], told: bool = False) -> Plant:
+    return setting(engine=planted.OtherPhysics(change), told=told)
+
+
+FAULTS: Mapping[str, Fault] = {
+    "wrong condition": Fault("plan", ("plan",), in_plan(planted.denied)),
+    "missing step": Fault("plan", ("plan",), in_plan(planted.without)),
+    "exchanged skills": Fault("plan", ("plan",), in_plan(planted.swapped)),
+    "a step too many": Fault("plan", ("plan",), in_plan(planted.with_extra)),
+    "a skill 10 cm off": Fault("skill", ("skill",), offset_skill),
+    "a skill to the wrong side": Fault("skill", ("skill",), in_skill(planted.scaled(-1.0, 1.0, 1.0, 1.0))),
+    "a skill with x and y exchanged": Fault("skill", ("skill",), in_skill(planted.exchanged)),
+    "a skill that drifts aside": Fault("skill", ("skill",), in_skill(planted.drifting(0.6))),
+    "opposite answers": Fault("answers", ("query",), lie()),
+    "answers always no": Fault("answers", ("query",), lie(never=True)),
+    "random answers": Fault("answers", ("query",), flipped),
+    "opposite answers, skill 10 cm off": Fault("answers", ("query", "skill"), both(lie(), offset_skill)),
+    "view 15 steps late": Fault("perception", ("perception",), setting(shown=planted.late_view(15.0))),
+    "thing seen 10 cm aside": Fault("perception", ("perception",), setting(shown=planted.moved_thing(0.1, 0.0))),
+    "camera 10 cm aside, answers too": Fault("perception", ("perception",), sensor),
+    "rollouts cut at 40 steps": Fault("noise", ("not reproducible",), setting(told_steps=40)),
+    "hand at a quarter": Fault("motion", _HAND, done(planted.scaled(0.25, 0.25, 0.25, 1.0))),
+    "hand hardly rises or sinks": Fault("motion", _HAND, done(planted.scaled(1.0, 1.0, 0.05, 1.0))),
+    "hand mirrored": Fault("motion", _HAND, done(planted.scaled(-1.0, 1.0, 1.0, 1.0))),
+    "hand turned by 60 degrees": Fault("motion", _HAND, done(planted.turned(60.0))),
+    "hand 15 steps late": Fault("motion", _HAND, done(planted.Delayed(15, 0, 1, 2))),
+    "fingers 40 steps late": Fault("motion", _GRIPPER, done(planted.Delayed(40, 3))),
+    "gripper stays open": Fault("motion", _GRIPPER, done(planted.fingers(-1.0))),
+    "hand that drifts aside": Fault("motion", _HAND, done(planted.drifting(0.6), hidden=True)),
+    "hand with x and y exchanged": Fault("motion", _HAND, done(planted.exchanged, hidden=True)),
+    "hand timid in small motions": Fault("motion", _HAND, done(planted.timid, hidden=True)),
+    "simulator scales y by 0.1": Fault("motion", _HAND, simulated(1.0, 0.1, 1.0, 1.0)),
+    "simulator turns by 45 degrees": Fault("motion", _HAND, simulated(change=planted.turned(45.0))),
+    "slippery": Fault("physics", _ELSEWHERE, physics(planted.slippery)),
+    "heavy": Fault("physics", _ELSEWHERE, physics(planted.heavy)),
+    "stiff joints": Fault("physics", _ELSEWHERE, physics(planted.stiff)),
+    "slack hand": Fault("physics", _ELSEWHERE, physics(planted.slack, told=True)),
+    "weak fingers": Fault("physics", _ELSEWHERE, physics(planted.weak_fingers, told=True)),
+    "upside down": Fault("physics", _ELSEWHERE, physics(planted.upside_down)),
+    "noise of 0.6": Fault("noise", ("noise",), setting(noise=0.6)),
+    "noise of 0.7": Fault("noise", ("noise",), setting(noise=0.7)),
+    "noise of 0.8": Fault("noise", ("noise",), setting(noise=0.8)),
+    "noise of 0.9": Fault("noise", ("noise",), setting(noise=0.9)),
+    "noise of 1": Fault("noise", ("noise",), setting(noise=1.0)),
+    "other noise than told": Fault("noise", ("not reproducible", "noise"), setting(noise=1.0, told_noise=0.1)),
 }
-OUTSIDE: dict[str, Fault] = {
-    "view 15 steps late": Fault("outside", ("perception",), setting(shown=planted.late_view(15.0))),
-    "thing seen 10 cm aside": Fault("outside", ("perception",), setting(shown=planted.moved_thing(0.1, 0.0))),
-    "goal seen 15 cm aside": Fault("outside", ("perception",), setting(shown=planted.moved_goal(0.15, 0.0))),
-    "camera 10 cm aside, answers too": Fault("outside", ("perception",), sensor),
-    "simulator scales z by 0.1": Fault(
-        "outside", ("not reproducible",), setting(simulator=planted.Jammed(1.0, 1.0, 0.1, 1.0))
-    ),
-    "simulator mirrors x": Fault(
-        "outside", ("not reproducible",), setting(simulator=planted.Jammed(-1.0, 1.0, 1.0, 1.0))
-    ),
-    "rollouts cut at 40 steps": Fault("outside", ("not reproducible",), setting(told_steps=40)),
-    "other noise than told": Fault("outside", ("not reproducible",), setting(noise=1.0)),
-    "all actions a tenth, fingers too": Fault(
-        "outside", ("policy", "actuation"), setting(done=planted.scaled(0.1, 0.1, 0.1, 0.0))
-    ),
-}
-TWO: dict[str, Fault] = {
-    "opposite answers, wrong condition": Fault("two", ("query", "plan"), both(in_plan(planted.denied), lie())),
-    "opposite answers, skill 10 cm off": Fault("two", ("query", "skill"), both(lie(), offset_skill)),
-    "wrong condition, skill 10 cm off": Fault("two", ("plan", "skill"), both(in_plan(planted.denied), offset_skill)),
-    "missing step, opposite answers": Fault("two", ("plan", "query"), both(in_plan(planted.without), lie())),
-}
-MOTION: dict[str, Fault] = {
-    "hand with x and y exchanged": Fault("motion", ("actuation",), setting(done=planted.exchanged)),
-    "a skill with x and y exchanged": Fault("motion", ("skill",), in_skill(planted.exchanged)),
-    "hand that drifts aside": Fault("motion", ("actuation",), setting(done=planted.drifting(0.6))),
-    "a skill that drifts aside": Fault("motion", ("skill",), in_skill(planted.drifting(0.6))),
-    "hand timid in small motions": Fault("motion", ("actuation",), setting(done=planted.timid)),
-    "a skill timid in small motions": Fault("motion", ("skill",), in_skill(planted.timid)),
-}
-KINDS = {
-    "inside": "named right",
-    "outside": "no sound part named",
-    "two": "a planted one named",
-    "motion": "named right",
-}
-"""Kinds of faults and the causes that count as right."""
-FAULTS: Mapping[str, Fault] = {**INSIDE, **OUTSIDE, **TWO, **MOTION}
+"""Faults by name. A fault of the motion is in all plan steps; with noise, nothing is planted."""
+KINDS = tuple(dict.fromkeys(fault.kind for fault in FAULTS.values()))
 
 
 @dataclass(frozen=True)
@@ -206,7 +213,7 @@ def failures_of(fault: Fault, policy: str, args: Arguments, learned: Any, refere
     """What is said of the failures of a fault, in one step of the plans and in the next, and how."""
     found = 0
     for step in range(_MOST_TURNS):
-        if found >= _ENOUGH:
+        if found >= min(_ENOUGH, args.at_most):
             return
         start = perf_counter()
         sound = lw.Plans({task: lw.load_plans("MT50")[task] for task in args.tasks})
@@ -227,13 +234,17 @@ def failures_of(fault: Fault, policy: str, args: Arguments, learned: Any, refere
 
         lw.evaluate(
             actor, tasks=args.tasks, episodes_per_task=args.episodes, stop_at_success=True, also_record=RECORDED,
-            on_episode=keep, evaluator=cast.simulator or cast.evaluator, noise_scale=cast.noise, **run,
+            on_episode=keep, evaluator=cast.simulator or cast.evaluator, noise_scale=cast.noise, engine=cast.engine,
+            **run,
         )  # fmt: skip
         of_task = [[one for one in failed if one.task == task] for task in args.tasks]
         turns = [one for one in chain(*zip_longest(*of_task)) if one is not None]
         chosen = turns[: args.at_most - found]
         found += len(chosen)
-        told = {"actor": actor, "reference": reference, "evaluator": cast.evaluator, **run}
+        evaluator = (cast.simulator if cast.told else None) or cast.evaluator
+        noise = cast.noise if cast.told_noise is None else cast.told_noise
+        told = {"actor": actor, "reference": reference, "evaluator": evaluator, "noise_scale": noise, **run}
+        told["engine"] = cast.engine if cast.told else None
         yield from attribute_failures(chosen, cast.plans, **told)
         print(f"    {policy}, step {step + 1}: {len(failed)} failed, {perf_counter() - start:.0f} s", flush=True)
 
@@ -268,38 +279,32 @@ def table(found: Mapping[str, Mapping[str, list[dict[str, Any]]]]) -> str:
             right = sum(is_right(fault, one) for one in failures)
             cells = [str(count) if count else "" for count in counts]
             rows.append((name, policy, *cells, f"{right} of {len(failures)}"))
-    for (kind, policy), (right, count) in scores(found).items():
-        said = f"{kind}, {policy}: {KINDS[kind]} {right} of {count}, {right / count:.3f}"
-        some = [(FAULTS[name], one) for name, of in found.items() for one in of.get(policy, ())]
-        some = [(fault, one) for fault, one in some if fault.kind == kind]
-        if kind == "outside":
-            exact = sum(one["cause"] in fault.causes for fault, one in some)
-            said += f"; the fault itself {exact / len(some):.3f}"
-        if kind == "two":
-            exact = sum({one["cause"], one["also"]} == set(fault.causes) for fault, one in some)
-            said += f"; both {exact / len(some):.3f}"
-        told.append(said)
+    for (kind, policy), (right, count, sound) in scores(found).items():
+        told.append(
+            f"{kind}, {policy}: named right {right} of {count}, {right / count:.3f}; a sound part blamed {sound}"
+        )
+    totals = [sum(numbers) for numbers in zip(*scores(found).values(), strict=True)]
+    told.append(f"all: named right {totals[0]} of {totals[1]}; a sound part blamed {totals[2] / totals[1]:.3f}")
     return markdown_table(("planted", "policy", *CAUSES, "right"), rows) + "\n\n" + "\n".join(told) + "\n"
 
 
-def scores(found: Mapping[str, Mapping[str, list[dict[str, Any]]]]) -> dict[tuple[str, str], tuple[int, int]]:
-    """Kind of fault and policy to the number of failures whose cause was named right, and of all."""
-    counts: dict[tuple[str, str], tuple[int, int]] = {}
+def scores(found: Mapping[str, Mapping[str, list[dict[str, Any]]]]) -> dict[tuple[str, str], tuple[int, int, int]]:
+    """Kind of fault and policy to the number of failures whose cause was named right, of all, and of those in which a
+    sound part was blamed."""
+    counts: dict[tuple[str, str], tuple[int, int, int]] = {}
     for kind in KINDS:
         for policy in ("scripted", "learned"):
-            right = [
-                is_right(FAULTS[name], failure)
-                for name, by_policy in found.items()
-                if FAULTS[name].kind == kind
-                for failure in by_policy.get(policy, ())
-            ]
-            if right:
-                counts[kind, policy] = sum(right), len(right)
+            faults = [(FAULTS[name], one) for name, of in found.items() for one in of.get(policy, ())]
+            faults = [(fault, one) for fault, one in faults if fault.kind == kind]
+            if faults:
+                right = [is_right(*each) for each in faults]
+                sound = [one["cause"] in _PARTS and not is_right(fault, one) for fault, one in faults]
+                counts[kind, policy] = sum(right), len(faults), sum(sound)
     return counts
 
 
 def is_right(fault: Fault, failure: Mapping[str, Any]) -> bool:
-    return failure["cause"] in (*fault.causes, *(HARMLESS if fault.kind == "outside" else ()))
+    return failure["cause"] in fault.causes
 
 
 def main(args: Arguments) -> dict[str, dict[str, list[dict[str, Any]]]]:

@@ -216,7 +216,7 @@ def check_faults(args: Arguments) -> Iterator[tuple[str, bool]]:
         now = {", ".join(key): count for key, count in faults.scores(faults.main(chosen)).items()}
     if args.write:
         path.write_text(json.dumps(now, indent=0) + "\n", "utf-8")
-    for name, (right, of) in json.loads(path.read_text("utf-8")).items():
+    for name, (right, of, _) in json.loads(path.read_text("utf-8")).items():
         said = f"{name}: right in {now[name][0]} of {now[name][1]}, golden {right} of {of}"
         yield said, abs(now[name][0] / now[name][1] - right / of) <= MAX_FAULT_DIFFERENCE
 

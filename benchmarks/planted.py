@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -16,6 +17,7 @@ import lw_torchrl as lw
 from lw_torchrl.evaluation.diagnose.replacements import attended
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import PlanTables
+from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
 from lw_torchrl.transforms.qaf import plan_program
 
 OFFSET = 0.1  # metres, along x
@@ -97,25 +99,29 @@ class Altered(TensorDictModuleBase):
         actor: the policy.
         shown: of the observation (B, 39) and the task_id (B,), what the policy sees in its place.
         done: of what the policy wrote, the action (B, 4) in its action's place.
+        hidden: call the policy in a way that a hook on modules does not see, as a subclass does.
     """
 
-    def __init__(self, actor: Any, shown: Shown | None = None, done: Done | None = None) -> None:
+    row_by_row = True  # a delay remembers the rows of one call
+
+    def __init__(self, actor: Any, shown: Shown | None = None, done: Done | None = None, hidden: bool = False) -> None:
         super().__init__()
-        self.actor, self.shown, self.done, self.plans = actor, shown, done, actor.plans
+        self.actor, self.shown, self.done, self.hidden, self.plans = actor, shown, done, hidden, actor.plans
         self.in_keys, self.out_keys, self.draws = actor.in_keys, actor.out_keys, False
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         asked, told = tensordict.copy(), tensordict.get("observation")
         if self.shown is not None:
             asked.set("observation", self.shown(told, tensordict.get("task_id")))
-        written = self.actor(asked).set("observation", told)
+        act = self.actor.forward if self.hidden else self.actor
+        written = act(asked).set("observation", told)
         if self.done is not None:
             written.set("action", self.done(written))
         return tensordict.update(written.select(*self.out_keys))
 
     def with_plans(self, plans: lw.Plans) -> Altered:
         done = self.done.with_plans(plans) if isinstance(self.done, InStep) else self.done
-        return Altered(self.actor.with_plans(plans), self.shown, done)
+        return Altered(self.actor.with_plans(plans), self.shown, done, self.hidden)
 
 
 class InStep:
@@ -235,12 +241,81 @@ class Sensor(Transform):
         return Sensor(plans, self.aside)
 
 
-class Jammed(Transform):
-    """A simulator that executes the action times these factors, which nobody tells."""
+def turned(degrees: float) -> Callable[[Any], Tensor]:
+    """The action turned about the vertical axis."""
+    turn = torch.eye(4)
+    turn[0, 0] = turn[1, 1] = math.cos(math.radians(degrees))
+    turn[0, 1] = math.sin(math.radians(degrees))
+    turn[1, 0] = -turn[0, 1]
+    return lambda given: _action(given) @ turn
 
-    def __init__(self, *factors: float) -> None:
+
+class Delayed:
+    """The action, or only some of its entries, so many steps late in each episode."""
+
+    def __init__(self, steps: int, *entries: int) -> None:
+        self.steps, self.entries = steps, list(entries)
+        self._past: dict[tuple[int, int], list[Tensor]] = {}
+
+    def __call__(self, written: TensorDictBase) -> Tensor:
+        action, seen = written.get("action").clone(), written.get("observation")
+        first = (seen[:, :18] == seen[:, 18:36]).all(-1)  # at a reset, the previous state is the present one
+        rows = zip(written.get("task_id").tolist(), written.get("episode").tolist(), strict=True)
+        for which, row in {which: row for row, which in enumerate(rows)}.items():
+            past = self._past[which] = [] if which not in self._past or first[row] else self._past[which]
+            past.append(action[row].clone())
+            action[row, self.entries] = past[max(0, len(past) - 1 - self.steps)][self.entries]
+        return action
+
+
+class Jammed(Transform):
+    """A simulator that executes another action than it is given: ``change`` of the action (B, 4), or its product with
+    four factors."""
+
+    def __init__(self, *factors: float, change: Callable[[Tensor], Tensor] | None = None) -> None:
         super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
-        self.factors = torch.tensor(factors)
+        self.change = scaled(*factors) if change is None else change
 
     def _inv_apply_transform(self, action: Tensor) -> Tensor:
-        return action * self.factors
+        return self.change(action)
+
+
+class OtherPhysics:
+    """An engine of Meta-World whose MuJoCo models are changed."""
+
+    def __init__(self, change: Callable[[Any], None]) -> None:
+        self.change = change
+
+    def __call__(self, tasks: Any, **options: Any) -> MetaWorldEngine:
+        engine = MetaWorldEngine(tasks, **options)
+        for env in engine._envs:
+            self.change(env.model)
+        return engine
+
+
+def slippery(model: Any) -> None:
+    model.geom_friction[:] *= 0.01
+
+
+def heavy(model: Any) -> None:
+    """Everything that can move freely, or on a joint, is heavy."""
+    model.body_mass[:] *= 30.0
+    model.body_inertia[:] *= 30.0
+
+
+def stiff(model: Any) -> None:
+    model.dof_frictionloss[:] += 30.0
+
+
+def slack(model: Any) -> None:
+    """The hand follows its target slowly."""
+    model.eq_solref[:, 0] = 1.0
+
+
+def weak_fingers(model: Any) -> None:
+    model.actuator_gainprm[:, 0] *= 0.05
+    model.actuator_biasprm[:] *= 0.05
+
+
+def upside_down(model: Any) -> None:
+    model.opt.gravity[:] = (0.0, 0.0, 5.0)

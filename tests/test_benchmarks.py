@@ -198,17 +198,15 @@ def test_planted_faults_are_counted_and_read_again(tmp_path, monkeypatch, capsys
     options = {"tasks": ("drawer-open",), "faults": ("missing step",), "policies": ("scripted",), "episodes": 1}
     args = faults.Arguments(**options, out=tmp_path)
     faults.main(args)
-    assert "inside, scripted: named right 3 of 3, 1.000" in capsys.readouterr().out
+    assert "plan, scripted: named right 3 of 3, 1.000" in capsys.readouterr().out
     monkeypatch.setattr(faults, "failures_of", None)
     faults.main(args)
-    assert "inside, scripted: named right 3 of 3, 1.000" in capsys.readouterr().out
+    assert "plan, scripted: named right 3 of 3, 1.000" in capsys.readouterr().out
 
 
-def test_faults_outside_the_list_have_no_right_part():
-    late, missing = faults.FAULTS["view 15 steps late"], faults.FAULTS["missing step"]
-    right = {cause: faults.is_right(late, {"cause": cause}) for cause in ("perception", "undecided", "skill")}
-    assert right == {"perception": True, "undecided": True, "skill": False}
-    assert [faults.is_right(missing, {"cause": cause}) for cause in ("plan", "undecided")] == [True, False]
+def test_a_wrong_cause_counts_as_blame_only_if_it_names_a_part():
+    found = {"missing step": {"scripted": [{"cause": cause, "also": None} for cause in ("plan", "undecided", "skill")]}}
+    assert faults.scores(found) == {("plan", "scripted"): (1, 3, 1)}
 
 
 def test_points_are_where_fingers_fit_or_a_hand_pushes():

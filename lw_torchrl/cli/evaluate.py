@@ -38,7 +38,7 @@ class Rollout:
     noise: Scale = 0.1  # standard deviation of the noise on the executed action
     max_steps: Maybe[Count] = None  # maximum time steps per episode (default: the suite's limit, 500 in Meta-World)
     stop_at_success: Flag = False  # end episodes at the first success; the success rate stays the same
-    attribute: Flag = False  # re-run failed episodes to find the cause: a query, the plan, a skill or the time limit
+    attribute: Flag = False  # measure and re-run failed episodes to find their cause
     reference: Annotated[tuple[str, ...], options.OPTIONAL, arg(metavar="SOURCES", help=_REFERENCE)] = ()
     device: options.Device = "cpu"
 

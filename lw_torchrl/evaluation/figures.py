@@ -18,7 +18,7 @@ _LONG_LABEL = 50  # longest legend label, in characters, that still fits into tw
 _CAUSE_COLORS: dict[str, str] = {
     **{"query": "#4c78a8", "plan": "#f58518", "skill": "#54a24b", "out of time": "#b279a2", "undecided": "#bab0ac"},
     **{"not reproducible": "#d5cec9", "perception": "#72b7b2", "gripper": "#eeca3b", "actuation": "#9d755d"},
-    **{"policy": "#e45756"},
+    **{"policy": "#e45756", "environment differs": "#ff9da6", "noise": "#7f7f7f"},
 }
 
 

@@ -5,10 +5,11 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
+from benchmarks import planted
 from benchmarks.planted import Altered, Jammed, Sensor, fingers, moved_thing, scaled
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.diagnose.counterfactuals import difference
-from lw_torchrl.evaluation.diagnose.failure import Difference, Misled
+from lw_torchrl.evaluation.diagnose.failure import Difference, Misled, WrongMotion
+from lw_torchrl.evaluation.diagnose.reruns import difference
 from lw_torchrl.evaluation.diagnose.sentences import finding_text
 
 TASK, SEED = "drawer-open", 7
@@ -58,7 +59,7 @@ def test_the_first_difference_between_two_runs_is_found():
     again = rollout([0.0, 1.0, 2.0], [0.5, 0.5, 0.5])
     assert difference(again, again) is None
     assert difference(again[:2], again) == Difference("length", 1, 2, 3)
-    assert difference(rollout([0.0, 1.0, 3.0], [0.5, 0.5, 0.5]), again) == Difference("environment", 2)
+    assert difference(rollout([0.0, 1.0, 3.0], [0.5, 0.5, 0.5]), again) == Difference("environment", 2, size=1.0)
     actions = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.2, 0.5]), again)
     assert (actions.part, actions.at, actions.size) == ("actions", 1, pytest.approx(0.3))
     assert "the executed actions, from step 1 on, by 0.3 at that step" in finding_text(actions)
@@ -73,7 +74,8 @@ def test_a_wrong_observation_is_found(inside):
     evaluator = None if inside else Sensor(PLANS, 0.1)
     episodes = run(actor, evaluator=evaluator)
     [failure] = attribute_failures(episodes, PLANS, actor=actor, evaluator=evaluator, **RUN)
-    assert (failure.cause, failure.counterfactuals) == ("perception", {"perception": True})
+    assert failure.cause == "perception"
+    assert failure.counterfactuals["perception"] is True
     assert isinstance(failure.finding, Misled)
     assert failure.finding.error == pytest.approx(0.1, abs=1e-3)
     assert "was off by up to 0.1" in failure.why
@@ -86,7 +88,7 @@ def test_a_wrong_observation_is_found(inside):
     [
         ("push", fingers(-1.0), "gripper"),
         pytest.param("drawer-open", scaled(-1.0, 1.0, 1.0, 1.0), "actuation", marks=pytest.mark.slow),
-        pytest.param("push", scaled(0.05, 0.05, 0.05, 0.0), "policy", marks=pytest.mark.slow),
+        pytest.param("push", scaled(0.05, 0.05, 0.05, 0.0), "actuation", marks=pytest.mark.slow),
     ],
 )
 def test_the_wrong_part_of_the_action_is_found(task, done, cause):
@@ -97,6 +99,54 @@ def test_the_wrong_part_of_the_action_is_found(task, done, cause):
     assert failure.cause == cause
     assert "this fixes 100% of the task's failed episodes" in failure.why
     assert "a plain re-run 0%" in failure.why
+
+
+def test_a_wrapper_that_is_a_function_is_seen():
+    policy = scripted()
+
+    def mirrored(tensordict):
+        tensordict = policy(tensordict)
+        return tensordict.set("action", tensordict["action"] * torch.tensor([-1.0, 1.0, 1.0, 1.0]))
+
+    episodes = run(mirrored, plans=PLANS)
+    [failure] = attribute_failures(episodes, PLANS, actor=mirrored, **RUN)
+    assert (failure.cause, failure.replaced) == ("actuation", "wrapper")
+    assert (failure.finding.right, failure.finding.shape) == ("decided", "scaled")
+
+
+def test_a_simulator_that_executes_other_actions_is_found():
+    simulator = Jammed(change=planted.turned(90.0))
+    [failure] = attribute_failures(
+        run(scripted(), evaluator=simulator), PLANS, actor=scripted(), evaluator=simulator, **RUN
+    )
+    assert (failure.cause, failure.replaced) == ("actuation", "wrapper")
+    assert isinstance(failure.finding, WrongMotion)
+    assert failure.finding.right == "commanded"
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_other_physics_is_found(told):
+    engine = planted.OtherPhysics(planted.slack)
+    episodes = run(scripted(), engine=engine)
+    [failure] = attribute_failures(episodes, PLANS, actor=scripted(), engine=engine if told else None, **RUN)
+    assert failure.cause == "environment differs"
+    assert failure.replaced == ("environment" if told else None)
+    if not told:
+        assert failure.finding.part == "environment"
+
+
+def test_a_first_state_of_another_seed_is_another_environment():
+    [episode] = run(scripted(), max_steps=20)
+    [failure] = attribute_failures([episode], PLANS, actor=scripted(), **{**RUN, "seed": SEED + 1, "max_steps": 20})
+    assert (failure.cause, failure.at) == ("environment differs", 0)
+    assert "check that seed, suite and engine are those of the rollout" in failure.why
+
+
+@pytest.mark.slow
+def test_noise_is_blamed_for_what_noise_does():
+    episodes = run(scripted(), noise_scale=1.0)
+    [failure] = attribute_failures(episodes, PLANS, actor=scripted(), **RUN, noise_scale=1.0)
+    assert (failure.cause, failure.counterfactuals["no noise"]) == ("noise", True)
 
 
 def test_a_failure_of_a_policy_without_plans_has_no_step():
@@ -111,4 +161,4 @@ def test_a_failure_of_a_policy_without_plans_has_no_step():
     assert failure.cause in ("actuation", "policy")
     assert failure.step is None
     assert "skill" not in failure.counterfactuals
-    assert failure.finding is None
+    assert failure.finding is None or isinstance(failure.finding, WrongMotion), "a finding without a plan step"

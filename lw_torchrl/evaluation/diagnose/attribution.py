@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -14,9 +14,17 @@ from torchrl.envs import EnvBase
 from lw_torchrl._util.checks import Count, Scale, missing_keys, typed
 from lw_torchrl._util.devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, Rerun, null_control
-from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, Cause, Difference, Failure, Finding
-from lw_torchrl.evaluation.diagnose.replacements import EpisodeId, Scripts, own_evaluators
+from lw_torchrl.evaluation.diagnose.failure import (
+    REPLACEMENTS,
+    Cause,
+    Difference,
+    Failure,
+    Finding,
+    Misled,
+    WrongMotion,
+)
+from lw_torchrl.evaluation.diagnose.replacements import EpisodeId, Scripts, gripper_of, own_evaluators
+from lw_torchrl.evaluation.diagnose.reruns import Rerun, Reruns
 from lw_torchrl.evaluation.diagnose.states import EpisodeStates, Explanation, explain, stall_step, states_of
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
@@ -26,9 +34,15 @@ from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.suites.suite import Suite, find_suite
 
 MARGIN = 0.3  # a clear lead of one replacement, as a fraction of the task's failed episodes
-_FACTS = ("perception", "query")  # tried only after a wrong observation or answer was recorded, which is a fact
-_WIDER = {"skill": ("gripper", "actuation", "policy"), "gripper": ("policy",), "actuation": ("policy",)}
-"""Replacements that contain another replacement, so that they fix every episode that the contained one fixes."""
+_FACTS = (
+    "environment",
+    "perception",
+    "query",
+    "wrapper",
+)  # tried only after a wrong observation, answer or action was measured
+_PARTS = ("skill", "gripper", "actuation", "policy", "plan")  # in the order in which they count
+_SEEN = 0.01  # meters by which an observation must be wrong to count if correcting it does not help
+_CLEAR = 0.1  # root mean square by which executed actions must differ from the commanded ones
 
 
 @typed
@@ -50,29 +64,28 @@ def attribute_failures(
     device: str | torch.device | None = None,
     progress: bool = True,
 ) -> list[Failure]:
-    """Find the cause of each failed episode: the observations, the answers to the plan's conditions, the plan, a skill,
-    another part of the policy, or the time limit.
+    """Find the cause of each failed episode: the environment, the observations, the answers to the plan's conditions,
+    the plan, a skill, another part of the policy, the noise, or the time limit.
 
-    **A rule examines the states.** The cause is *query* if the policy acted on wrong answers; otherwise *plan* if, late
-    in the episode, plan and reference plan request different actions; otherwise *skill*. The rule is not a proof: a
-    plan that differs from the reference may succeed. Without a reference, the rule detects only wrong answers, a plan
-    without a true condition, and a skill that stays far from its target. Without ``actor``, only the rule is used.
+    Without ``actor``, a rule examines the states: the cause is *query* if the policy acted on wrong answers; *plan* if,
+    late in the episode, plan and reference request different actions, or no condition holds; otherwise *skill*.
 
-    **Counterfactual re-runs decide**, if ``actor`` is given. First comes the null control: the episode is re-run with
-    the same noise and nothing replaced. If the re-run succeeds, the failure is *not reproducible*, and the finding
-    reports what differs. Otherwise the episode is re-run with one part replaced by a trusted one:
+    With ``actor``, **measurements come first**. Each episode is re-run with the same noise and nothing replaced.
 
-    - *perception*: the true observations, if the policy received wrong observations;
-    - *query*: the true answers, if the policy acted on wrong answers;
-    - *plan*: the reference plan;
-    - *skill*: in one plan step, the action of a scripted skill (of the expert if the plan step has no scripted skill);
-      *gripper* and *actuation*: in all plan steps, only the gripper's or the hand's part of the action; *policy*: in
-      all plan steps, the whole action;
-    - *out of time*: twice the time limit.
+    - *environment differs*: the first state, or the state after the same action, differs from the rollout's, or the
+      episode succeeds in the suite's own engine;
+    - *not reproducible*: the re-run succeeds, and the finding reports what differs;
+    - *perception*: the policy was shown wrong observations; *query*: it acted on wrong answers; and it succeeds with
+      the true ones;
+    - *actuation* or *gripper*: something around the policy or the environment changed the motion or the gripper's
+      command, beyond the noise. If this happened in only one plan step, the cause is *skill*.
 
-    If no replacement helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one
-    that fixes most of the task's failed episodes counts; among about equally good ones, the smallest. A skill does not
-    count if other plan steps have the same fault. For a policy without plans, no plan step is reported.
+    **Replacements decide about what is left.** Scripts take control of the whole policy. If they succeed, the plan is
+    sound, and the scripts' actions show what the policy does differently: the *gripper*, the motion in one plan step
+    (*skill*) or in all (*actuation*). Scripts for only this part must succeed too, otherwise the cause is *policy*. If
+    they fail, the reference *plan* is tried, then twice the time (*out of time*), then pairs, which give ``cause`` and
+    ``also``. If the episode succeeds without noise, and this repairs about as many of the task's failed episodes as
+    the best replacement, no part is blamed, but the *noise*.
 
     Args:
         rollouts: episodes as :func:`evaluate` passes them to ``on_episode``, or TensorDicts of batch (T,), each with
@@ -93,8 +106,8 @@ def attribute_failures(
         A :class:`Failure` for each failed episode, in the order of the rollouts.
 
     Raises:
-        ValueError: a rollout lacks a key, an episode occurs twice, a task has no plan, the plans differ from the
-            actor's plans, or an episode does not start from the initial state of (task, seed, episode).
+        ValueError: a rollout lacks a key, an episode occurs twice, a task has no plan, or the plans differ from the
+            actor's plans.
 
     Example:
         >>> import lw_torchrl as lw
@@ -108,7 +121,7 @@ def attribute_failures(
         >>> _ = lw.evaluate(actor, tasks="reach", episodes_per_task=1, **run, **record)
         >>> [failure] = attribute_failures(episodes, plans, actor=actor, **run)
         >>> failure.cause, failure.counterfactuals
-        ('skill', {'skill': True})
+        ('skill', {'no noise': False, 'policy': True, 'skill': True})
 
     Source: a plan's conditions, skills and skill execution are separate in the policy, so each can be replaced.
     """
@@ -135,13 +148,10 @@ def attribute_failures(
     env_options = {"seed": seed, "suite": own_suite, "engine": engine, "num_threads": num_threads}
     env_options["max_steps"] = own_suite.max_steps if max_steps is None else max_steps
     rerun = Rerun(tasks, env_options, noise_scale, num_envs, device, progress)
-    null = null_control(rerun, {states.which: states.steps for states in seen}, actor, answered, evaluator)
-    tried = Counterfactuals(
-        actor, evaluator, None if trusted_scripts is None else trusted_scripts.plans, scripts, rerun, null
-    )
-    tried.run(seen, [states.which for states, explanation in explained if _plans_agree(explanation)])
-    shares = tried.shares()
-    return [_by_counterfactuals(*both, tried, shares.get(both[0].task, {}), seed) for both in explained]
+    reruns = Reruns(actor, evaluator, scripts, Plans(trusted) if trusted else None, rerun, {s.which: s for s in seen})
+    reruns.run()
+    shares = reruns.shares()
+    return [_by_reruns(*both, reruns, shares[both[0].task], seed) for both in explained]
 
 
 def _failed(rollouts: Iterable[Any], plans: Plans) -> list[tuple[str, int, TensorDictBase]]:
@@ -195,114 +205,104 @@ def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
     return ["observation", "task_id", "qaf", *keys, "skill_weights", "qaf_logits"]
 
 
-def _plans_agree(explanation: Explanation) -> bool:
-    """Return whether the plan and the reference request the same actions in all states of an episode."""
-    return explanation.evidence.get("plan_departs") == 0.0
-
-
-def _by_counterfactuals(
-    seen: EpisodeStates, explanation: Explanation, tried: Counterfactuals, shares: Mapping[str, float], seed: int
+def _by_reruns(
+    seen: EpisodeStates, explanation: Explanation, reruns: Reruns, shares: Mapping[str, float], seed: int
 ) -> Failure:
-    """Return the failure with two additions: the cause found by the counterfactual re-runs and the finding from the
-    states.
-    """
-    which, null = seen.which, tried.null
-    share, number = null.share(seen.task), float(sum(task == seen.task for task, _ in null.episodes))
-    record: dict[str, Any] = {"evidence": {**explanation.evidence, "failed": number}}
-    record["shares"] = {"nothing": share, **shares}
-    if null.succeeds(which) or (which in null.differs and share >= MARGIN):
-        first = null.differs.get(which, Difference("nothing", len(seen.steps) - 1))
-        record["succeeds_at"] = null.episodes[which].first_success
-        return Failure(seen.task, seed, seen.episode, "not reproducible", None, None, first.at, first, **record)
-    tried_here = {name: results[which] is not None for name, results in tried.results.items() if which in results}
-    record["counterfactuals"] = tried_here
+    """Return the failure with the cause found by the re-runs, and the finding that shows it."""
+    which, known = seen.which, {"shares": dict(shares)}
+    number = float(sum(task == seen.task for task, _ in reruns.seen))
+    record: dict[str, Any] = known | {"evidence": {**explanation.evidence, "failed": number}}
+    differs, again = reruns.differs.get(which), reruns.plain[which].first_success
+    if reruns.fails_elsewhere(which) or (differs is not None and shares["nothing"] >= MARGIN):
+        first = differs or Difference("nothing", len(seen.steps) - 1)
+        cause: Cause = "environment differs" if reruns.environment_differs(which) else "not reproducible"
+        return Failure(seen.task, seed, seen.episode, cause, None, None, first.at, first, succeeds_at=again, **record)
+    record["counterfactuals"] = tried = {
+        name: results[which] is not None for name, results in reruns.results.items() if which in results
+    }
     # If both plans request the same actions, a success with the reference is not due to the reference's content.
-    same = _plans_agree(explanation)
-    counting = [name for name in tried.mending(seen) if not (same and name == "plan")]
-    decision = decide(counting, shares, share)
-    cause, also, mended = decision.cause, decision.also, tried.mended(decision.by, which)
-    # If the motion is wrong only in one step, the skill of that step is to blame.
-    only = tried.step_of_motion(seen) if cause == "actuation" else None
-    cause = cause if only is None else "skill"
-    if mended is not None:
-        record |= {"replaced": decision.by, "rival": decision.rival, "succeeds_at": len(mended.steps), "mended": mended}
-        if cause == "actuation" and tried_here.get("skill") and "skill" not in counting:
-            record["scripted_step"] = tried.step[which]
-    elif explanation.cause == "query" and "query" not in tried_here and not (same and tried_here.get("plan")):
+    same = explanation.evidence.get("plan_departs") == 0.0
+    mended = [name for name, success in tried.items() if success and not (same and name == "plan")]
+    cause, also, by = decide(mended, shares)
+    step, motion = reruns.step.get(which), None
+    # Changed actions are a fact, so they are to blame even if the episode also fails without the change.
+    found = _wrong_motion(reruns, which, "decided", by), _wrong_motion(reruns, which, "commanded", by)
+    measured = [each for each in found if each[1] is not None]
+    if measured and by not in ("environment", "perception", "query"):
+        cause, motion, step = max(measured, key=lambda each: each[1].error if each[1] else 0.0)
+        by, also = "wrapper" if by == "wrapper" else None, None
+    elif by in ("gripper", "actuation"):
+        motion = _wrong_motion(reruns, which, "scripted", by)[1]
+    elif cause == "undecided" and explanation.cause == "query" and "query" not in tried:
         cause = "query"  # wrong answers are a fact, even if they could not be replaced
-    step: int | None
+    elif cause == "undecided" and which in reruns.misled and reruns.misled[which].error > _SEEN:
+        cause = "perception"
+    if (episode := reruns.mended(by, which)) is not None:
+        record |= {"replaced": by, "succeeds_at": len(episode.steps), "mended": episode}
     finding: Finding | None
-    step, at, finding = explanation.blames.get(cause, explanation.blames["undecided"])
-    if cause == "skill" and also is None:
-        step, plan = tried.step[which] if only is None else only, tried.plans[seen.task]
-        at, finding = stall_step(seen, step, plan.definition.layout), seen.active_time(plan, step)
+    place, at, finding = explanation.blames.get(cause, explanation.blames["undecided"])
+    if cause == "skill" and also is None and step is not None:
+        plan = reruns.scripts.plans[seen.task]
+        place, at, finding = step, stall_step(seen, step, plan.definition.layout), seen.active_time(plan, step)
     elif cause == "perception":
-        finding = null.misled[which]
+        finding = reruns.misled[which]
     elif cause == "undecided" and explanation.cause != "undecided":
         record["suspect"], finding = explanation.cause, explanation.blames[explanation.cause].finding
-    if plans_of(tried.actor) is None and cause != "query":
-        step = None
-    finding = None if step is None and cause != "perception" else finding
-    return Failure(seen.task, seed, seen.episode, cause, also, step, at, finding, **record)
+    elif motion is not None:
+        finding = motion
+    planless = plans_of(reruns.actor) is None and cause != "query"
+    finding = finding if not planless or isinstance(finding, Misled | WrongMotion) else None
+    return Failure(seen.task, seed, seen.episode, cause, also, None if planless else place, at, finding, **record)
 
 
-class Decision(NamedTuple):
-    """A failure's cause, a second cause, the deciding replacement (``by``), and the next best one (``rival``)."""
+def _wrong_motion(
+    reruns: Reruns, which: EpisodeId, right: Literal["decided", "commanded", "scripted"], by: str | None = None
+) -> tuple[Cause, WrongMotion | None, int | None]:
+    """Return the part of the action that differs from the right action, the finding, and its plan step if only one."""
+    compared = {"decided": reruns.wrapped, "commanded": reruns.executed, "scripted": reruns.scripted}[right]
+    if (motion := compared.get(which)) is None:
+        return "undecided", None, None
+    gripper = gripper_of(reruns.scripts.plans)
+    hand, fingers = motion.of(~gripper), motion.of(gripper)
+    part = fingers if by == "gripper" or (by != "actuation" and fingers.error() > 4 * hand.error()) else hand
+    if part.error() < (0.0 if by == "wrapper" or right == "scripted" else _CLEAR):
+        return "undecided", None, None
+    in_all, worst, shape = part.extent(exact=right != "scripted")
+    errors = part.errors()
+    steps = sum(error > 0.1 * max(errors.values()) for error in errors.values())
+    name: Literal["gripper", "motion"] = "gripper" if part is fingers else "motion"
+    finding = WrongMotion(name, right, shape, part.error(), steps)
+    if part is fingers:
+        return "gripper", finding, None
+    return ("skill", finding, worst) if in_all is False else ("actuation", finding, None)
 
-    cause: Cause
-    also: Cause | None = None
-    by: str | None = None
-    rival: str | None = None
 
-
-def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0.0) -> Decision:
+def decide(mended: Collection[str], shares: Mapping[str, float]) -> tuple[Cause, Cause | None, str | None]:
     """Decide the cause of a failed episode from the replacements with which the episode succeeds (``mended``).
 
-    ``shares`` is, for each replacement, the fraction of the task's failed episodes it was tried on that it fixes;
-    ``null`` is that fraction for a plain re-run.
+    ``shares`` is, for each replacement, the fraction of the task's failed episodes it was tried on that it fixes, and
+    for "nothing" the fraction that a plain re-run fixes. Return a cause, a second cause, and the deciding replacement.
 
-    Wrong observations and answers come first, if correcting them helps. Among the other replacements, the one that
-    fixes most of the task's failed episodes counts. Among about equally good ones, the first in this order counts: the
-    plan, unless scripts that follow the plan succeed; a skill in one plan step; the gripper or the motion. The cause is
-    the policy as a whole if two replacements that do not contain each other are about equally good, or if none is
-    clearly better than a plain re-run. The time limit comes last, then pairs.
+    Measured errors come first, if correcting them helps. Then comes the smallest part of the policy whose replacement
+    by scripts helps: a skill in one plan step, the gripper or the motion (of these two, the one that fixes more).
+    Scripts for the whole policy show that the plan is sound, but not which part is to blame. The plan comes next. A
+    part counts only if it fixes clearly more of the task's failed episodes than a re-run with nothing replaced, and
+    than a re-run without noise.
     """
-    single = {name: causes[0] for name, causes in REPLACEMENTS.items() if len(causes) == 1}
-    fixes = {name: shares.get(name, 1.0) for name in single if name in mended}
-    time = fixes.pop("time", None)
-    if not fixes:
-        if time is not None:
-            return Decision("out of time", by="time")
-        pair = choose_pair(mended, shares)
-        return Decision("undecided") if pair is None else Decision(*pair)
-    if "policy" in fixes and any(name in fixes for name in ("skill", "gripper", "actuation")):
-        fixes.pop("plan", None)  # the plan is sound, because scripts that follow it succeed
-    best = next(iter(fixes))
-    if facts := [name for name in fixes if name in _FACTS]:
+    fixes = {name: shares.get(name, 1.0) for name in mended}
+    if facts := [name for name in _FACTS if name in fixes]:
         best = max(facts, key=fixes.__getitem__)
-    else:
-        for name, share in fixes.items():
-            if share >= fixes[best] + MARGIN:
-                best = name
-    rivals = {name: share for name, share in fixes.items() if name != best and name not in _WIDER.get(best, ())}
-    rival = max(rivals, key=rivals.__getitem__, default=None)
-    close = rival is not None and best not in _FACTS and best != "plan" and rivals[rival] > fixes[best] - MARGIN
-    if fixes[best] < null + MARGIN or (close and best != "policy"):
-        return Decision("policy", by=best, rival=rival)
-    return Decision(single[best], by=best, rival=rival)
-
-
-def choose_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tuple[Cause, Cause, str] | None:
-    """Return the pair of causes that counts, and the replacement that fixes both; None if no pair helps.
-
-    Wrong answers come first, then the cause whose replacement fixes more episodes on its own.
-    """
-    alone = {**shares, "skill": max(shares.get("skill", 0.0), shares.get("policy", 0.0))}
-    pairs = [name for name in mended if len(REPLACEMENTS[name]) > 1]
-    if not pairs:
-        return None
-    by = max(pairs, key=lambda name: sum(alone.get(cause, 0.0) for cause in REPLACEMENTS[name]))
-    cause, also = REPLACEMENTS[by]
-    if cause != "query" and alone.get(also, 0.0) > alone.get(cause, 0.0):
-        cause, also = also, cause
-    return cause, also, by
+        return REPLACEMENTS[best][0], None, best
+    if best := next((name for name in _PARTS if name in fixes), ""):
+        if best == "gripper" and "actuation" in fixes:
+            best = max(("gripper", "actuation"), key=fixes.__getitem__)
+            if abs(fixes["gripper"] - fixes["actuation"]) < MARGIN:
+                return "policy", None, best
+        if fixes[best] >= fixes.get("no noise", -1.0) + MARGIN:
+            clear = fixes[best] >= shares.get("nothing", 0.0) + MARGIN
+            return REPLACEMENTS[best][0] if clear else "policy", None, best
+    for name in ("no noise", "time"):
+        if name in fixes:
+            return REPLACEMENTS[name][0], None, name
+    pair = next((name for name in mended if len(REPLACEMENTS[name]) > 1), None)
+    return ("undecided", None, None) if pair is None else (REPLACEMENTS[pair][0], REPLACEMENTS[pair][1], pair)

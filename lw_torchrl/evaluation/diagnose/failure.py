@@ -12,10 +12,11 @@ from tensordict import TensorDictBase
 from lw_torchrl._util.checks import Count, Natural, Scale, shown, typed_fields
 from lw_torchrl.language.plans import ConditionalPlan
 
-Blamed = Literal["not reproducible", "perception", "query", "plan", "skill", "gripper", "actuation", "policy"]
-Cause = Literal[Blamed, "out of time", "undecided"]
+Blamed = Literal["perception", "query", "plan", "skill", "gripper", "actuation", "policy"]
+Cause = Literal["environment differs", "not reproducible", Blamed, "noise", "out of time", "undecided"]
 
 CAUSES: dict[str, str] = {
+    "environment differs": "the environment differs from that of the re-run, or from the suite's",
     "not reproducible": "a plain re-run succeeds",
     "perception": "the policy received a wrong observation",
     "query": "a condition was answered wrongly",
@@ -24,25 +25,32 @@ CAUSES: dict[str, str] = {
     "gripper": "the gripper opened or closed wrongly",
     "actuation": "the hand moved wrongly in several steps",
     "policy": "the policy acted wrongly, unclear which part",
+    "noise": "the action noise, not a part of the policy",
     "out of time": "the episode succeeds with more time",
     "undecided": "no replacement helps",
 }
 """A mapping from each cause to its meaning."""
 
 REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
+    "environment": ("environment differs",),
     "perception": ("perception",),
     "query": ("query",),
+    "wrapper": ("actuation",),
     "plan": ("plan",),
     "skill": ("skill",),
     "gripper": ("gripper",),
     "actuation": ("actuation",),
     "policy": ("policy",),
+    "no noise": ("noise",),
     "time": ("out of time",),
     "query + skill": ("query", "skill"),
     "query + plan": ("query", "plan"),
     "plan + skill": ("plan", "skill"),
 }
-"""A mapping from each replacement to the causes to blame if an episode succeeds with that replacement."""
+"""A mapping from each replacement to the causes to blame if an episode succeeds with that replacement.
+
+For "wrapper", the cause is "skill" or "gripper" if the wrapper changes only these.
+"""
 
 Finite = Annotated[float, Is[lambda x: abs(x) < 1e300]]
 _Replacement = Annotated[str, Is[lambda name: name in REPLACEMENTS]]
@@ -116,6 +124,23 @@ class Misled:
 
 @typed_fields
 @dataclass(frozen=True)
+class WrongMotion:
+    """A finding: in plan steps ``steps``, the action differed by ``error`` (root mean square) from the right one.
+
+    ``right`` is the action to compare with: the "decided" one (the action of the policy's innermost module, which a
+    wrapper changed), the "commanded" one (the policy's action, which the environment executed differently), or the
+    "scripted" one (a trusted skill's). ``shape`` is the simplest fault that explains the error.
+    """
+
+    part: Literal["motion", "gripper"]
+    right: Literal["decided", "commanded", "scripted"]
+    shape: str  # "constant", "scaled", "shifted", "delayed by 3", "turned" or "irregular"
+    error: Scale
+    steps: int  # the number of plan steps with this error
+
+
+@typed_fields
+@dataclass(frozen=True)
 class Difference:
     """A finding: the first difference between the rollout and the plain re-run of an episode, in state ``at``.
 
@@ -131,7 +156,7 @@ class Difference:
     size: Scale | None = None
 
 
-Finding = WrongAnswers | NoCondition | PlanDeparts | ActiveStep | Misled | Difference
+Finding = WrongAnswers | NoCondition | PlanDeparts | ActiveStep | Misled | WrongMotion | Difference
 _FINDINGS = {kind.__name__: kind for kind in get_args(Finding)}
 
 
@@ -160,10 +185,7 @@ class Failure:
         at: the time step of the episode to look at first (0-based).
         finding: what the episode's states show about ``cause``, or about ``suspect``.
         replaced: the replacement that decided the cause, one of :data:`REPLACEMENTS`; None if no replacement did.
-        rival: the next best replacement.
         succeeds_at: the time step at which the episode succeeds with ``replaced``, or in a plain re-run.
-        scripted_step: a plan step in which using a scripted skill also makes the episode succeed, although other plan
-            steps have the same fault.
         suspect: the cause that the states alone suggest, if ``cause`` is "undecided".
         evidence: numbers measured in the episode's states, by name.
         counterfactuals: for each replacement that was tried (see :func:`attribute_failures`), whether the episode
@@ -182,9 +204,7 @@ class Failure:
     at: Natural
     finding: Finding | None = None
     replaced: _Replacement | None = None
-    rival: _Replacement | None = None
     succeeds_at: Count | None = None
-    scripted_step: Natural | None = None
     suspect: Cause | None = None
     evidence: _Numbers = field(default_factory=dict)
     counterfactuals: _Tried = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Trusted parts that replace the parts of a policy: true observations, exact answers, and scripted skills."""
+"""Trusted parts that replace the parts of a policy, and a record of what the policy was shown and what it did."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
+from torch.nn.modules.module import register_module_forward_hook, register_module_forward_pre_hook
 
 from lw_torchrl._util.keys import write
-from lw_torchrl.evaluation.diagnose.failure import Misled
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.skill_program import SkillProgram
@@ -23,74 +23,23 @@ from lw_torchrl.language.tasks import TASKS, task_id
 from lw_torchrl.modules.attention import ACTIVE_WEIGHT
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.suites.metaworld.experts import ExpertActor
-from lw_torchrl.transforms.qaf import plan_program
 
 EpisodeId = tuple[str, int]  # task and episode index
 TRUE_OBSERVATION = "true_observation"  # the environment's observation, before any transform or module changes it
+SHOWN, DECIDED, COMMANDED, SCRIPTED = "shown_observation", "decided_action", "commanded_action", "scripted_action"
 _REST = ScriptedSkill("", GRIPPER, gain=(0.0, 0.0, 0.0))  # stands in for a plan step without a scripted skill
 _RULER = 1e-3  # gain (action per meter) to measure distances, so small that no action is clipped
 
 
-class Perception:
-    """A context manager that detects wrong observations at a policy's input, and corrects them if ``correct`` is True.
-
-    Hooks on the policy's innermost modules see changes made by the modules around them, but not by plain functions.
-    """
-
-    def __init__(self, actor: Any, correct: bool = False) -> None:
-        self.actor, self.correct = actor, correct
-        self.misled: dict[tuple[int, int], Misled] = {}  # by (task id, episode), for episodes with wrong observations
-        self._now: TensorDictBase | None = None
-        self._hooks: list[Any] = []
-
-    def __enter__(self) -> Perception:
-        if isinstance(self.actor, nn.Module):
-            self._hooks = [self.actor.register_forward_pre_hook(self._begin)]
-            self._hooks += [module.register_forward_pre_hook(self._look) for module in _innermost(self.actor)]
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for hook in self._hooks:
-            hook.remove()
-
-    def _begin(self, module: nn.Module, args: tuple[Any, ...]) -> None:
-        self._now = args[0].select(TRUE_OBSERVATION, "task_id", "episode", "_step", strict=False).clone()
-
-    def _look(self, module: nn.Module, args: tuple[Any, ...]) -> None:
-        tensordict = args[0] if args and isinstance(args[0], TensorDictBase) else None
-        shown = None if tensordict is None else tensordict.get("observation", None)
-        true = None if self._now is None else self._now.get(TRUE_OBSERVATION, None)
-        if tensordict is None or self._now is None or shown is None or true is None or shown.shape != true.shape:
-            return
-        error = (shown - true).abs()
-        for row in (error.amax(-1) > 0).logical_and(self._now.get("_step")).nonzero().flatten().tolist():
-            which = int(self._now.get("task_id")[row]), int(self._now.get("episode")[row])
-            misled = Misled(float(error[row].max()), int(error[row].argmax()))
-            previous = self.misled.get(which, misled)
-            self.misled[which] = max(previous, misled, key=lambda each: (each.error, each.number))
-        if self.correct:
-            tensordict.set("observation", true.clone())
-
-
-def _innermost(actor: nn.Module) -> list[nn.Module]:
-    """Return the modules that map an observation to an action and contain no other such module."""
-
-    def acts(module: nn.Module) -> bool:
-        return "observation" in getattr(module, "in_keys", ()) and "action" in getattr(module, "out_keys", ())
-
-    acting = [module for module in actor.modules() if acts(module)]
-    return [each for each in acting if not any(part is not each and acts(part) for part in each.modules())] or [actor]
-
-
 class TrueAnswers(QueryEvaluator):
-    """A query evaluator with exact answers, whose logits are 5 for true and -5 for false."""
+    """A query evaluator that keeps the environment's exact answers; its logits are 5 for true and -5 for false."""
 
     def __init__(self, plans: Plans) -> None:
         super().__init__(plans)
-        self.program = plan_program(plans)
+        self.in_keys = ["qaf"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        truth = self.program(tensordict.get("observation"), tensordict.get("task_id"))
+        truth = tensordict.get("qaf")
         return write(tensordict, self, [truth, 10.0 * truth.to(torch.float32) - 5.0])
 
 
@@ -148,47 +97,70 @@ def attended(weights: Tensor, steps: Tensor) -> Tensor:
     return torch.where(none, -1, first)
 
 
-class ScriptedControl(nn.Module):
-    """A policy whose attention weights mix the actions of scripted skills, instead of decoding an action.
+class Control(nn.Module):
+    """A policy that records what it is shown and what it does, and that trusted parts control if requested.
 
-    If no plan step is active, the policy's own action is kept. If the active plan step has no scripted skill, the
-    expert acts. ``steps`` maps (task, episode) to the plan step in which scripts take control (None for all plan
-    steps); ``part`` is the part of the action to replace, "displacement" or "gripper" (None for both).
+    It writes the observation at the input of the policy's innermost module (``SHOWN``), that module's action
+    (``DECIDED``; differs from the policy's own action, ``COMMANDED``, if a wrapper changes it), and the action of the
+    scripted skills, mixed by the policy's attention weights (``SCRIPTED``; NaN without active or scripted plan step).
+
+    Args:
+        actor: the policy.
+        scripts: the scripted skills of the plans that the policy follows.
+        correct: show the true observation to the innermost module.
+        unwrap: execute the innermost module's action.
+        part: the part of the action that scripts take over: "motion", "gripper" or "all"; None for no part. If no plan
+            step is active, the policy's own action is kept. If the active step has no scripted skill, the expert acts.
+        steps: for each (task, episode), the only plan step in which scripts take over; None for all plan steps.
     """
 
     def __init__(
         self,
         actor: Callable[[TensorDictBase], TensorDictBase],
-        plans: Plans,
         scripts: Scripts,
-        steps: Mapping[EpisodeId, int] | None = None,
+        correct: bool = False,
+        unwrap: bool = False,
         part: str | None = None,
+        steps: Mapping[EpisodeId, int] | None = None,
     ) -> None:
         super().__init__()
-        self.actor, self.scripts = actor, scripts
+        self.actor, self.scripts, self.correct, self.unwrap = actor, scripts, correct, unwrap
+        self.row_by_row = bool(getattr(actor, "row_by_row", False))
+        plans = scripts.plans
         self._tables = PlanTables(plans)
         self._known = torch.zeros_like(self._tables.mask)
         for row, task in enumerate(self._tables.index.tasks):
             self._known[row, : len(plans[task].steps)] = torch.tensor(scripts.known[task])
         self._steps = None if steps is None else {(task_id(task), k): step for (task, k), step in steps.items()}
         unscripted = [task for task, known in scripts.known.items() if not all(known) and task in TASKS]
-        self._expert = ExpertActor(unscripted) if unscripted else None
-        numbers = torch.arange(plans.layout.action_size)
-        gripper = numbers == torch.tensor(-1 if plans.layout.gripper is None else plans.layout.gripper)
-        self._taken = numbers >= 0 if part is None else gripper if part == "gripper" else ~gripper
+        self._expert = ExpertActor(unscripted) if unscripted and part is not None else None
+        gripper = gripper_of(plans)
+        self._taken = {None: gripper & ~gripper, "gripper": gripper, "motion": ~gripper}.get(part, gripper | True)
+        self._innermost: dict[nn.Module, bool] = {}
+        self._calls: list[tuple[Tensor, Tensor]] = []  # what innermost modules were shown and decided
+        self._true: Tensor | None = None
+        self._shown = torch.empty(0)
+        self._inside: list[nn.Module] = []  # the innermost module while it runs
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        true, observation, task = (tensordict.get(key).clone() for key in (TRUE_OBSERVATION, "observation", "task_id"))
         seen = tensordict.select("observation", "task_id", "episode", "_step", strict=False).clone()
-        tensordict = self.actor(tensordict)
-        action, task = tensordict.get("action"), seen.get("task_id")
-        rows = self._tables.rows(task)
-        mask, known = self._tables.mask.to(action.device)[rows], self._known.to(action.device)[rows]
-        weights = tensordict.get("skill_weights", None)
-        if weights is None:  # put all the weight on the first plan step whose condition holds, otherwise on the last
-            truth = (tensordict.get("qaf") > 0.5) & mask
-            first = torch.where(truth.any(-1), truth.int().argmax(-1), mask.sum(-1) - 1)
-            weights = one_hot(first, mask.shape[-1]).float()
-        step = attended(weights, mask)
+        self._true, self._calls = true, []
+        if self.correct:
+            tensordict.set("observation", true.clone())
+        hooks = [register_module_forward_pre_hook(self._correct), register_module_forward_hook(self._look)]
+        try:
+            tensordict = self.actor(tensordict)
+        finally:
+            self._true, self._inside = None, []
+            for hook in hooks:
+                hook.remove()
+        action = tensordict.get("action")
+        # The members of an ensemble decide together, so that no single one of their actions is to be executed.
+        shown, decided = self._calls[0] if self._calls else (observation, action)
+        decided = decided if len(self._calls) == 1 else action
+        weights, scripted, step = self._script(tensordict, seen.get("observation"), task)
+        tensordict.update({SHOWN: shown, DECIDED: decided, COMMANDED: action.clone(), SCRIPTED: scripted})
         replaced = step >= 0
         if self._steps is not None:
             # Scripts take control where the plan step to replace in the row's episode has a noticeable weight.
@@ -196,13 +168,58 @@ class ScriptedControl(nn.Module):
             own = torch.tensor([self._steps.get(which, -1) for which in episodes], device=action.device)
             weight = weights.gather(-1, own.clamp(min=0).unsqueeze(-1)).squeeze(-1)
             replaced = replaced & (weight > ACTIVE_WEIGHT) & (own >= 0)
-        scripted = (weights * known).unsqueeze(-1) * self.scripts.program(seen.get("observation"), task)
-        proper = scripted.sum(-2).to(action.dtype)
-        unknown = ~known.gather(-1, step.clamp(min=0).unsqueeze(-1)).squeeze(-1)
-        if self._expert is None:
-            replaced = replaced & ~unknown
-        elif (needed := replaced & unknown).any():
-            expert = self._expert(seen.set("_step", needed).cpu()).get("action").to(action.device)
-            proper = torch.where(unknown.unsqueeze(-1), expert, proper)
-        taken = replaced.unsqueeze(-1) & self._taken.to(action.device)
-        return tensordict.set("action", torch.where(taken, proper, action))
+        unknown = replaced & scripted.isnan().any(-1)
+        if self._expert is not None and unknown.any():
+            expert = self._expert(seen.set("_step", unknown).cpu()).get("action").to(action.device)
+            scripted = torch.where(unknown.unsqueeze(-1), expert, scripted)
+        taken = (replaced & ~scripted.isnan().any(-1)).unsqueeze(-1) & self._taken.to(action.device)
+        return tensordict.set("action", torch.where(taken, scripted, decided if self.unwrap else action))
+
+    def _script(self, written: TensorDictBase, observation: Tensor, task: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the weights (B, S) of the plan steps, the scripts' action (B, A), and the active plan step (B,)."""
+        rows = self._tables.rows(task)
+        mask, known = self._tables.mask.to(task.device)[rows], self._known.to(task.device)[rows]
+        weights = written.get("skill_weights", None)
+        if weights is None:  # put all the weight on the first plan step whose condition holds, otherwise on the last
+            truth = (written.get("qaf") > 0.5) & mask
+            first = torch.where(truth.any(-1), truth.int().argmax(-1), mask.sum(-1) - 1)
+            weights = one_hot(first, mask.shape[-1]).float()
+        step = attended(weights, mask)
+        unscripted = (step < 0) | ~known.gather(-1, step.clamp(min=0).unsqueeze(-1)).squeeze(-1)
+        scripted = ((weights * known).unsqueeze(-1) * self.scripts.program(observation, task)).sum(-2)
+        scripted = scripted.to(written.get("action").dtype)
+        return weights, scripted.masked_fill(unscripted.unsqueeze(-1), torch.nan), step
+
+    def _watched(self, module: nn.Module, tensordict: Any) -> bool:
+        """Return whether a module is a whole policy: it acts, and it is our own or contains no other one that acts."""
+        if self._true is None or not isinstance(tensordict, TensorDictBase):
+            return False
+        if module not in self._innermost:
+            inner = [] if type(module).__module__.startswith("lw_torchrl.") else [*module.modules()][1:]
+            self._innermost[module] = _acts(module) and not any(map(_acts, inner))
+        shown = tensordict.get("observation", None) if self._innermost[module] else None
+        return shown is not None and shown.shape == self._true.shape
+
+    def _correct(self, module: nn.Module, args: tuple[Any, ...]) -> None:
+        if not self._inside and args and self._watched(module, args[0]):
+            assert self._true is not None
+            self._inside, self._shown = [module], args[0].get("observation").clone()
+            if self.correct:
+                args[0].set("observation", self._true.clone())
+
+    def _look(self, module: nn.Module, args: tuple[Any, ...], output: Any) -> None:
+        if self._inside and module is self._inside[0]:
+            self._inside = []
+            if isinstance(output, TensorDictBase):
+                self._calls.append((self._shown, output.get("action").clone()))
+
+
+def gripper_of(plans: Plans) -> Tensor:
+    """Return (A,) bool: which entry of an action is the gripper's."""
+    numbers = torch.arange(plans.layout.action_size)
+    return numbers == (-1 if plans.layout.gripper is None else plans.layout.gripper)
+
+
+def _acts(module: nn.Module) -> bool:
+    """Return whether a module maps an observation to an action."""
+    return "observation" in getattr(module, "in_keys", ()) and "action" in getattr(module, "out_keys", ())

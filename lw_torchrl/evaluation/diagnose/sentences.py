@@ -12,17 +12,21 @@ from lw_torchrl.evaluation.diagnose.failure import (
     NoCondition,
     PlanDeparts,
     WrongAnswers,
+    WrongMotion,
 )
 
 _TEXTS = {
+    "environment": ("the suite's own engine", "the engine"),
     "perception": ("the true observations", "the observations"),
     "query": ("the true answers", "the answers"),
     "plan": ("the reference plan", "the plan"),
+    "wrapper": ("the actions that the policy's innermost module decides", "the changed actions"),
     "skill": ("a scripted skill in one step", "the skill of one step"),
     "gripper": ("the gripper under scripted control", "the gripper's commands"),
     "actuation": ("the hand's motion under scripted control", "the hand's motion"),
     "policy": ("scripted skills in every step", "all actions"),
-    "out of time": ("twice the time", "the time limit"),
+    "no noise": ("no noise", "the noise"),
+    "time": ("twice the time", "the time limit"),
 }
 """A mapping from each cause to the part that its replacement inserts, and the part that is removed."""
 _IN_PAIRS = _TEXTS | {"skill": ("scripted skills", "all actions")}
@@ -30,25 +34,24 @@ _IN_PAIRS = _TEXTS | {"skill": ("scripted skills", "all actions")}
 
 def replacement_text(name: str) -> str:
     """Return the parts that a replacement inserts, for example "the true answers and scripted skills"."""
-    return " and ".join(new for new, _ in _texts(name))
+    return " and ".join(_texts(name, 0))
 
 
 def replaced_text(name: str) -> str:
     """Return the parts that a replacement removes, for example "the answers and all actions"."""
-    return " and ".join(old for _, old in _texts(name))
+    return " and ".join(_texts(name, 1))
 
 
-def _texts(name: str) -> list[tuple[str, str]]:
-    causes = REPLACEMENTS[name]
-    return [(_IN_PAIRS if len(causes) > 1 else _TEXTS)[cause] for cause in causes]
+def _texts(name: str, number: int) -> list[str]:
+    return [_TEXTS[name][number]] if name in _TEXTS else [_IN_PAIRS[cause][number] for cause in REPLACEMENTS[name]]
 
 
 def explain_failure(failure: Failure) -> str:
     """Explain in a few sentences why an episode failed."""
     parts = [] if failure.finding is None else [finding_text(failure.finding)]
-    if failure.cause == "not reproducible":
-        fails = "fails in a different way, and other episodes of the task succeed"
-        ending = fails if failure.succeeds_at is None else "succeeds"
+    if failure.cause in ("environment differs", "not reproducible"):
+        others = "" if failure.cause == "environment differs" else ", and other episodes of the task succeed"
+        ending = f"fails in a different way{others}" if failure.succeeds_at is None else "succeeds"
         parts = [f"a plain re-run {ending}", *parts]
     elif not failure.shares:  # no episode was re-run, so only the rule decided the cause
         parts = ["The states alone do not show the cause", *parts] if failure.cause == "undecided" else parts
@@ -63,13 +66,7 @@ def _counterfactual_texts(failure: Failure) -> list[str]:
         first, second = _IN_PAIRS[failure.cause][0], _IN_PAIRS[failure.also][0]
         return [f"neither {first} nor {second} is enough; with both, the episode succeeds"]
     if failure.replaced is not None:
-        parts = [_success_text(failure)]
-        if failure.cause == "skill" and failure.replaced == "actuation" and failure.step is not None:
-            parts.append(f"the motion is wrong only in step {failure.step + 1}")
-        if failure.scripted_step is not None:
-            suffices = f"a scripted skill in step {failure.scripted_step + 1} suffices too"
-            parts.append(f"{suffices}, but the motion is as wrong in other steps")
-        return parts
+        return [_success_text(failure)]
     if failure.counterfactuals.get("plan"):
         parts = ["the episode succeeds with the reference plan, but both plans request the same action in every state"]
     elif failure.cause == "query":
@@ -88,8 +85,8 @@ def _success_text(failure: Failure) -> str:
     share = failure.shares.get
     text = f"with {replacement_text(failure.replaced)} the same episode succeeds, at t = {failure.succeeds_at}"
     shares = [f"this fixes {share(failure.replaced, 1.0):.0%} of the task's failed episodes"]
-    if failure.rival is not None:
-        shares.append(f"{replacement_text(failure.rival)} {share(failure.rival, 1.0):.0%}")
+    if "no noise" in failure.shares and failure.replaced != "no noise":
+        shares.append(f"a re-run without noise {share('no noise', 0.0):.0%}")
     shares.append(f"a plain re-run {share('nothing', 0.0):.0%}")
     return f"{text}; {', '.join(shares)}"
 
@@ -114,12 +111,25 @@ def finding_text(finding: Finding) -> str:
         case Misled(error, number):
             wrong = f"entry {number} was off by up to {error:.2g}"
             return f"the policy's observation differed from the true one: {wrong}"
+        case WrongMotion(part, right, shape, error, steps):
+            what = {"motion": "the hand's motion", "gripper": "the gripper's command"}[part]
+            than = {
+                "decided": "what the policy's innermost module decided",
+                "commanded": "what the policy commanded plus the noise",
+                "scripted": "the scripted skill's",
+            }
+            where = f"in {steps} plan step{'s' if steps > 1 else ''}, by {error:.2g} (root mean square)"
+            return f"{what} differed from {than[right]} {where}: it was {shape}"
         case Difference(part, at, given, again, size):
             differ = f"from step {at} on, by {size or 0:.2g} at that step, due to noise or a random policy"
             texts = {
                 "length": f"the length: the rollout has {given} steps, the re-run {again}",
                 "actions": f"the executed actions, {differ}",
-                "environment": f"the environment: the same action in state {at - 1} leads to a different state",
+                "environment": (
+                    f"the environment: the same action in state {at - 1} leads to a different state"
+                    if at
+                    else "the first state; check that seed, suite and engine are those of the rollout"
+                ),
                 "states": f"the states, from {at} on; the rollout holds no actions, so record them to find out more",
                 "nothing": "in data that were not recorded",
             }

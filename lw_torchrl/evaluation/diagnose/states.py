@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torch.nn.functional import one_hot, pad
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torch.nn.functional import one_hot
 
-from lw_torchrl._util.devices import device_of
 from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Cause, Finding, NoCondition, PlanDeparts, WrongAnswers
 from lw_torchrl.evaluation.diagnose.replacements import Scripts, attended
-from lw_torchrl.evaluation.plan_use import where_stuck
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules.parts import evaluating
-from lw_torchrl.modules.policy import draws, plans_of
 from lw_torchrl.transforms.qaf import truth_of_episode
 
-_OFTEN, _BRIEF = 0.4, 5  # "often": more than this fraction of a plan step's states; with fewer than 5, undecided
-_SAME = 0.02  # actions that differ from the script's by less than this count as equal
-_HALF = 0.5  # the fraction of the error that a fault may leave unexplained, and that counts in other plan steps
+_BRIEF = 5  # with fewer states, a plan step's error is not measured
+_SAME = 0.02  # actions that differ by less than this count as equal
+_HALF = 0.5  # the fraction of an error that a fault may leave unexplained
+_DELAYS = 26  # delays up to this number of time steps are tried
 _LATE = 100  # number of last states of a failed episode, in which the episode made no progress
 _AHEAD, _STILL = 10, 0.01  # the hand stands still if it moves less than 1 cm in 10 states
 _AWAY = 25  # longest interruption (in states) of a visit to a plan step, so that two alternating steps are one visit
@@ -32,89 +27,94 @@ _WRONG = 0.01  # the smallest fraction of states with wrong answers that counts
 OTHER = 0.3  # actions that differ by more than this on any axis serve different purposes
 
 
-class ScriptComparison(NamedTuple):
-    """A policy's actions in T states, and the actions of the active plan steps' scripted skills."""
+class Motion(NamedTuple):
+    """What was done in T states, what should have been done, and the active plan step."""
 
-    done: Tensor  # (T, A) float32, the policy's actions
-    wanted: Tensor  # (T, A) float32, the scripts' actions; infinite where the active plan step has no scripted skill
-    active: Tensor  # (T,) int64, the active plan step, -1 for none
+    wanted: Tensor  # (T, A) float32, NaN where unknown
+    done: Tensor  # (T, A) float32
+    active: Tensor  # (T,) int64, -1 for none
 
-    def followed_by(self, other: ScriptComparison | None) -> ScriptComparison:
-        """Return the comparison with another episode's states appended."""
-        if other is None:
-            return self
-        return ScriptComparison(*(torch.cat(both) for both in zip(self, other, strict=True)))
+    def and_also(self, other: Motion) -> Motion:
+        """Return the motion with another episode's states appended."""
+        return Motion(*(torch.cat(both) for both in zip(self, other, strict=True)))
 
-    def part(self, numbers: Tensor) -> ScriptComparison:
-        """Return the comparison of the action's entries selected by ``numbers`` (A,) bool."""
-        return ScriptComparison(self.done[:, numbers], self.wanted[:, numbers], self.active)
+    def of(self, entries: Tensor) -> Motion:
+        """Return the motion of the action's entries selected by ``entries`` (A,) bool, where it is known."""
+        known = (self.active >= 0) & self.wanted.isfinite().all(-1)
+        return Motion(self.wanted[known][:, entries], self.done[known][:, entries], self.active[known])
 
-    def differ_by(self, size: float) -> Tensor:
-        """Return (T,) bool: whether actions differ by more than ``size`` on any axis; False if no step is active."""
-        return (self.done - self.wanted).abs().amax(-1).masked_fill(self.active < 0, 0.0) > size
+    def error(self) -> float:
+        """Return the largest error (root mean square) among the plan steps that were active in 5 states or more."""
+        return max(self.errors().values(), default=0.0)
 
-    def unlike(self) -> Tensor:
-        """Return (T,) bool: whether the policy's action differs from the script's."""
-        return self.differ_by(_SAME)
+    def errors(self) -> dict[int, float]:
+        found = {}
+        for step in self.active.unique().tolist():
+            here = self.active == step
+            if here.sum() >= _BRIEF and self.done.shape[-1]:
+                found[step] = _rms(self.done - self.wanted, here)
+        return found
 
-    def far(self, steps: Iterable[int]) -> float:
-        """Return the largest fraction, over plan steps, of a step's states with actions far from the script's."""
-        far, stays = self.differ_by(OTHER), [self.active == step for step in steps]
-        return max((float(far[stay].float().mean()) for stay in stays if stay.sum() >= _BRIEF), default=0.0)
+    def predicted(self, where: Tensor) -> tuple[str, Tensor]:
+        """Return the simplest fault that explains the error in the states ``where`` (T,) bool, and its actions (T, A).
 
-    def often_far(self, steps: Iterable[int]) -> bool:
-        return self.far(steps) > _OFTEN
-
-    def seldom_far(self, steps: Iterable[int]) -> bool:
-        return self.far(steps) < _OFTEN / 2
-
-    def in_other_steps(self, step: int) -> bool | None:
-        """Return whether the other plan steps have the same fault as ``step``; None if that cannot be decided.
-
-        The fault is estimated on the axis with the largest error, as a factor of the script's action or as a shift. The
-        other plan steps have the fault if it explains more than half of their error. The result is None if neither a
-        factor nor a shift explains the error in ``step``, if the fault would not show in the other plan steps, or if
-        their error is large (more than half of the error in ``step``) but unexplained.
+        Each fault is fitted to these states by least squares: a constant, a factor for each axis, a shift, a delay of
+        whole steps, or a linear map of all axes. "irregular" explains too little.
         """
-        known = self.wanted.isfinite().all(-1) & (self.active >= 0)
-        inside, others = known & (self.active == step), known & (self.active != step)
-        if min(int(inside.sum()), int(others.sum())) < _BRIEF:
-            return None
-        axis = int((self.done - self.wanted)[inside].square().mean(0).argmax())
-        done, wanted = self.done[:, axis], self.wanted[:, axis]
-        factor = (done * wanted)[inside].sum() / wanted[inside].square().sum().clamp(min=_SAME**2)
-        faults = [factor * wanted, wanted + (done - wanted)[inside].mean()]
-        faults = [fault for fault in faults if _off(done - fault, inside) < _HALF * _off(done - wanted, inside)]
-        faults = [fault for fault in faults if _off(fault - wanted, others) > _SAME]
-        off = _off(done - wanted, others)
-        if any(_off(done - fault, others) < _HALF * off for fault in faults):
-            return True
-        return None if not faults or off > _HALF * _off(done - wanted, inside) else False
+        wanted, done = self.wanted, self.done
+        square = wanted[where].square().sum(0).clamp(min=1e-6)
+        factor = (done * wanted)[where].sum(0) / square
+        ones = torch.cat((wanted, wanted * wanted.abs(), torch.ones_like(wanted[:, :1])), -1)
+        ridge = 1e-4 * torch.eye(ones.shape[-1])
+        linear = torch.linalg.solve(ones[where].mT @ ones[where] + ridge, ones[where].mT @ done[where])
+        faults = {"constant": done[where].mean(0).expand_as(done), "scaled": factor * wanted}
+        faults["shifted"] = wanted + (done - wanted)[where].mean(0)
+        for delay in range(1, min(_DELAYS, len(wanted) - 1)):
+            faults[f"delayed by {delay}"] = torch.cat((wanted[:1].expand(delay, -1), wanted[:-delay]))
+        faults["turned"] = ones @ linear
+        left = {name: _rms(done - fault, where) for name, fault in faults.items()}
+        best = min(left.values())
+        name = next(name for name in left if left[name] <= 1.25 * best + 0.25 * _SAME)
+        return name if left[name] < _HALF * _rms(done - wanted, where) else "irregular", faults[name]
+
+    def extent(self, exact: bool = False) -> tuple[bool | None, int, str]:
+        """Return whether the fault is in all plan steps, the plan step with the largest error, and the fault's shape.
+
+        The fault of the plan step with the largest error predicts what would be done in the other plan steps. It is in
+        all plan steps if it explains their errors, or if they have other errors about as large. It is in one plan step
+        if the others lack an error that the fault predicts. None if neither can be decided. If ``exact``, there are no
+        other errors, so that any error in other plan steps shows the fault.
+        """
+        errors = self.errors()
+        if not errors:
+            return None, -1, "irregular"
+        worst = max(errors, key=errors.__getitem__)
+        here = self.active == worst
+        name, fault = self.predicted(here)
+        others = ~here & torch.isin(self.active, torch.tensor(list(errors)))
+        if not others.any():
+            return None, worst, name
+        measured, expected = _rms(self.done - self.wanted, others), _rms(fault - self.wanted, others)
+        # A policy that equals the scripts in many states has no other errors either.
+        equal = float(((self.done - self.wanted).abs().amax(-1) < 1e-5).float().mean()) > 0.1
+        if (exact and measured > 1e-3) or (equal and measured > _SAME):
+            return True, worst, name
+        unexplained = _rms(self.done - fault, others)
+        if min(errors.values()) > _SAME and name == "irregular" and min(errors.values()) > _HALF * errors[worst]:
+            return True, worst, name
+        if measured <= _SAME:  # the other plan steps are executed exactly
+            shows = expected > 2 * measured + 0.25 * _SAME
+            return (False if shows else None if measured == 0.0 else unexplained < measured), worst, name
+        if unexplained < _HALF * measured or (name != "irregular" and unexplained < 0.8 * measured):
+            return True, worst, name
+        sound = [step for step, error in errors.items() if error <= _SAME]
+        if measured < _HALF * errors[worst] and (expected > 2 * measured or sound):
+            return False, worst, name
+        return (True if measured > _HALF * errors[worst] else None), worst, name
 
 
-def _off(values: Tensor, where: Tensor) -> float:
-    return float(values[where].square().mean().sqrt())
-
-
-def compare_with_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> ScriptComparison | None:
-    """Compare a policy's actions with the scripts' actions in an episode's states.
-
-    Return None if the policy's actions cannot be computed, because it is stochastic or reads keys not recorded.
-    """
-    keys = [key for key in getattr(actor, "in_keys", ()) if key != "qaf"]
-    plans = plans_of(actor)
-    is_known = isinstance(actor, TensorDictModuleBase) and not draws(actor)
-    if not is_known or any(seen.steps.get(key, None) is None for key in keys):
-        return None
-    states = seen.steps.select(*keys).clone()
-    if "qaf" in actor.in_keys and plans is not None:
-        states.set("qaf", pad(seen.answers, (0, plans.num_steps - seen.answers.shape[1])))
-    with torch.no_grad(), evaluating(actor), set_exploration_type(ExplorationType.DETERMINISTIC):
-        action = actor(states.to(device_of(actor))).get("action").cpu()
-    program = scripts.program(seen.steps.get("observation"), seen.steps.get("task_id"))[:, : seen.weights.shape[1]]
-    wanted = (seen.weights.unsqueeze(-1) * program).sum(-2)
-    unscripted = ~torch.tensor(scripts.known[seen.task])[seen.active]
-    return ScriptComparison(action, wanted.masked_fill(unscripted.unsqueeze(-1), torch.inf), seen.active)
+def _rms(values: Tensor, where: Tensor) -> float:
+    return float(values[where].square().sum(-1).mean().sqrt())
 
 
 class EpisodeStates(NamedTuple):
@@ -161,10 +161,15 @@ def chosen(truth: Tensor, steps: int) -> Tensor:
     return torch.where(here.any(-1), here.int().argmax(-1), steps - 1)
 
 
+def exact_answers(plan: ConditionalPlan, steps: TensorDictBase) -> Tensor:
+    """Return the exact answers (T, S) bool to a plan's conditions in an episode's states."""
+    return truth_of_episode(Plans([plan]), steps)[:, : len(plan.steps)]
+
+
 def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, answers: Tensor | None) -> EpisodeStates:
     """Return an episode's states under the policy's plan; ``answers`` are used if no ``qaf_logits`` were recorded."""
     number = len(plans[task].steps)
-    truth = truth_of_episode(Plans([plans[task]]), steps)[:, :number]
+    truth = exact_answers(plans[task], steps)
     if (logits := steps.get("qaf_logits", None)) is not None:
         answers = logits > 0
     elif answers is None and (recorded := steps.get("qaf", None)) is not None:
@@ -174,24 +179,6 @@ def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, answ
     weights = one_hot(chosen(answers, number), number).float() if weights is None else weights[:, :number]
     active = attended(weights, torch.ones_like(weights, dtype=torch.bool))
     return EpisodeStates(task, episode, steps, truth, answers, weights, active)
-
-
-def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
-    """Return the plan steps that may be to blame for a failure, the likeliest first.
-
-    Only the states ``among`` (T,) bool count (None for all). The furthest and the most frequent plan step late in the
-    episode come first, then the furthest and the most frequent of the whole episode, then the others by frequency.
-    """
-    counted = seen.active >= 0 if among is None else (seen.active >= 0) & among
-    if not counted.any():
-        return []
-    active = one_hot(seen.active.clamp(min=0), seen.truth.shape[1]) * counted.unsqueeze(-1)
-    ranked: list[int] = []
-    for window in (_LATE, len(active)):
-        if counted[-window:].any():
-            ranked += reversed(where_stuck(active, window))
-    ranked += torch.bincount(seen.active[counted]).argsort(descending=True).tolist()
-    return [step for step in dict.fromkeys(ranked) if step in seen.active[counted]]
 
 
 def last_stay_start(states: Tensor) -> int:
@@ -222,7 +209,8 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
     """
     plan, length = scripts.plans[seen.task], len(seen.active)
     late = min(_LATE, length)
-    stuck = next(iter(candidates(seen)), len(plan.steps) - 1)
+    late_steps = seen.active[-late:][seen.active[-late:] >= 0]
+    stuck = int(torch.bincount(late_steps).argmax()) if len(late_steps) else len(plan.steps) - 1
     stalled = stall_step(seen, stuck, scripts.plans.layout)
     blames, evidence = {}, {"states": float(length)}
 
@@ -288,8 +276,7 @@ def _departs(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return whether plan and reference request different actions (T,) bool, and the chosen plan step of each (T,)."""
     observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
-    answers = truth_of_episode(Plans([other]), seen.steps)
-    ours, theirs = chosen(seen.truth, len(plan.steps)), chosen(answers, len(other.steps))
+    ours, theirs = chosen(seen.truth, len(plan.steps)), chosen(exact_answers(other, seen.steps), len(other.steps))
     rows = torch.arange(len(ours))
     done = scripts.program(observation, task_id)[rows, ours]
     wanted = other_scripts.program(observation, task_id)[rows, theirs]
