@@ -247,8 +247,8 @@ def table(found: dict[tuple[str, str], list[EvaluationResult]]) -> str:
 
 def main(args: Arguments) -> None:
     if args.quick:
-        short = {"policy_steps": 300, "steps": 200, "tuning_steps": 50, "episodes": 2}
-        args = replace(args, tasks=args.tasks[:2], seeds=args.seeds[:1], **short)
+        args = replace(args, tasks=args.tasks[:2], seeds=args.seeds[:1], episodes=2)
+        args = replace(args, policy_steps=300, steps=200, tuning_steps=50)
     found: dict[tuple[str, str], list[EvaluationResult]] = {}
     for seed in args.seeds:
         for source in args.plans:
