@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictSequential
 import lw_torchrl as lw
 from benchmarks.evaluator_report import condition_drift, drift_table, write_report
 from benchmarks.figures import markdown_table
-from lw_torchrl._util.files import write_text
+from lw_torchrl._util.files import read_toml, write_text
 from lw_torchrl.cli.demo import DemoConfig
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.modules import transform_of
@@ -34,9 +34,17 @@ class Arguments:
 
     seeds: tuple[int, ...] = (0, 1, 2)
     """Random seeds of demonstrations, labelled states, weights and minibatches."""
+    plans: tuple[str, ...] = ("MT10",)
+    """Plans of the tasks: MT10, a .plan or .json file, a folder, or a .toml file of programs by task. Policies of
+    several plans learn from the same demonstrations, and use the same evaluators."""
     labels: tuple[float, ...] = (1.0, 0.01)
     """Fractions of the labelled states to train evaluators on."""
+    wrong: float | None = None
+    """Also tune evaluators of all labels that noise in their weights makes wrong: this fraction of their answers to the
+    conditions of MT10's shipped plans, in the demonstrations' states."""
     tasks: tuple[str, ...] = lw.MT10
+    policy_steps: int = RECIPE.training_steps
+    """Number of minibatches of a policy's training."""
     steps: int = 6000
     """Number of minibatches of an evaluator's training."""
     tuning_steps: int = 2000
@@ -95,15 +103,42 @@ def in_front(evaluator: lw.QueryEvaluator, actor: Any) -> TensorDictSequential:
     return TensorDictSequential(evaluator, actor)
 
 
-class Bench:
-    """The parts of one seed, each kept in files and done once."""
+def load_plans(source: str) -> lw.Plans:
+    """Load plans, or programs from a .toml file that maps tasks to texts."""
+    if Path(source).suffix != ".toml":
+        return lw.load_plans(source)
+    programs = read_toml(Path(source), ValueError)
+    return lw.Plans([lw.ConditionalPlan.from_program(text, task) for task, text in programs.items()])
 
-    def __init__(self, args: Arguments, seed: int) -> None:
-        self.args, self.seed, self.folder = args, seed, args.out / f"seed{seed}"
-        self.plans = lw.load_plans("MT10")
+
+def wrong_rate(policy: Any, states: Any) -> float:
+    """Return the fraction of an evaluator's, or a policy's, answers to conditions that are wrong."""
+    return 1.0 - float(np.mean([drift.agreement for drift in condition_drift(policy, states)]))
+
+
+def add_noise(evaluator: Any, states: Any, rate: float, seed: int) -> None:
+    """Add normal noise to the weights of an evaluator, of a scale at which the fraction ``rate`` of its answers is
+    wrong. The errors stay: equal states get equal answers."""
+    generator = torch.Generator().manual_seed(seed)
+    weights = {name: value.clone() for name, value in evaluator.network.state_dict().items()}
+    noise = {name: torch.randn(value.shape, generator=generator) * value.std() for name, value in weights.items()}
+    low, high = 0.0, 4.0
+    for _ in range(12):
+        scale = (low + high) / 2
+        evaluator.network.load_state_dict({name: value + scale * noise[name] for name, value in weights.items()})
+        low, high = (low, scale) if wrong_rate(evaluator, states) > rate else (scale, high)
+
+
+class Bench:
+    """The parts of one seed under one source of plans, each kept in files and done once."""
+
+    def __init__(self, args: Arguments, seed: int, source: str) -> None:
+        self.args, self.seed, self.shared = args, seed, args.out / f"seed{seed}"
+        self.folder = self.shared / Path(source).stem
+        self.plans = load_plans(source)
 
     def demonstrations(self) -> lw.LanguageWorldExperienceReplay:
-        return demonstrations(self.folder / "demonstrations", self.args.tasks, self.seed)
+        return demonstrations(self.shared / "demonstrations", self.args.tasks, self.seed)
 
     def policy(self) -> Any:
         """The few-shot policy, trained on exact answers."""
@@ -111,14 +146,13 @@ class Bench:
         replay.append_transform(lw.QAFTransform(self.plans))
         torch.manual_seed(self.seed)
         actor = lw.PlanConditionedActor(self.plans)
-        steps = 300 if self.args.quick else RECIPE.training_steps
-        config = lw.BehavioralCloningConfig(steps=steps, batch_size=RECIPE.batch_size, seed=self.seed)
+        config = lw.BehavioralCloningConfig(steps=self.args.policy_steps, batch_size=RECIPE.batch_size, seed=self.seed)
         lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=self.folder / "policy.safetensors").train()
         return lw.load_actor(self.folder / "policy.safetensors")
 
     def evaluator(self, share: float) -> Any:
         """One trained on the answers in so large a share of the states; its report is printed."""
-        roots = [self.folder / "states" / who for who in WHO]
+        roots = [self.shared / "states" / who for who in WHO]
         for who, root in zip(WHO, roots, strict=True):
             noise = (0.0, 0.1, 0.2) if who == "expert" else 0.0
             lw.collect_demonstrations(
@@ -129,14 +163,21 @@ class Bench:
         states = lw.LanguageWorldExperienceReplay(roots, label="executed")
         labelled = lw.training.LabelledQueries(states, config)
         torch.manual_seed(self.seed)
-        evaluator = lw.modules.StateQueryEvaluator(self.plans)
-        file = self.folder / f"evaluator-{share:g}.safetensors"
+        evaluator = lw.modules.StateQueryEvaluator(lw.load_plans("MT10"))  # the network depends on no plan
+        file = self.shared / f"evaluator-{share:g}.safetensors"
         lw.training.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file).train()
         held_out = labelled if config == most else lw.training.LabelledQueries(states, most)
-        report = write_report(evaluator, held_out, self.folder / f"evaluator-{share:g}.json", most=2)
+        report = write_report(evaluator, held_out, file.with_suffix(".json"), most=2)
         number = labelled.describe()["states"]["training"]
         print(f"seed {self.seed}, {number} labelled states:\n{report}", flush=True)
         return lw.training.load_evaluator(file, self.plans)
+
+    def wrong_evaluator(self, rate: float) -> Any:
+        """One trained on all answers, and then made wrong."""
+        evaluator = self.evaluator(1.0)
+        shipped = evaluator.with_plans(lw.load_plans("MT10"))  # shares its weights
+        add_noise(shipped, self.demonstrations()[:], rate, self.seed)
+        return evaluator
 
     def tuned(self, name: str, actor: Any, anchor: float) -> Any:
         """A policy tuned by its demonstrations' loss, its evaluator too if it has one."""
@@ -144,7 +185,7 @@ class Bench:
         if (transform := transform_of(actor)) is not None:
             replay.append_transform(transform)
         config = lw.BehavioralCloningConfig(
-            steps=50 if self.args.quick else self.args.tuning_steps,
+            steps=self.args.tuning_steps,
             batch_size=RECIPE.batch_size,
             learning_rate=self.args.tuning_rate,
             normalize=False,
@@ -155,7 +196,7 @@ class Bench:
         lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=file).train()
         if evaluators_of(actor):
             drifts = condition_drift(actor, replay[:])
-            table = drift_table(drifts, most=8)
+            table = f"{wrong_rate(actor, replay[:]):.3f} of the answers are wrong\n{drift_table(drifts, most=8)}"
             write_text(file.with_suffix(".txt"), table)
             print(f"seed {self.seed}, {name}, conditions in the demonstrations' states:\n{table}", flush=True)
         return lw.load_actor(file)
@@ -168,37 +209,52 @@ class Bench:
         """Each row of the table: what answers, and how it went."""
         policy = self.policy()
         yield "query answering function", self.success("qaf", policy)
-        yield "the same, tuned as long", self.success("qaf-tuned", self.tuned("qaf-tuned", self.policy(), 0.0))
+        if self.args.labels:
+            yield "the same, tuned as long", self.success("qaf-tuned", self.tuned("qaf-tuned", self.policy(), 0.0))
         for share in self.args.labels:
             evaluator = self.evaluator(share)
             told = f"evaluator, {100 * share:g}% of the labels"
             yield told, self.success(f"evaluator-{share:g}", in_front(evaluator, policy))
             for anchor in self.args.anchors:
                 name = f"evaluator-{share:g}-tuned-{anchor:g}"
-                fresh = lw.training.load_evaluator(self.folder / f"evaluator-{share:g}.safetensors", self.plans)
+                fresh = lw.training.load_evaluator(self.shared / f"evaluator-{share:g}.safetensors", self.plans)
                 begun = in_front(fresh, self.policy())
                 yield f"{told}, tuned, anchor {anchor:g}", self.success(name, self.tuned(name, begun, anchor))
+        if self.args.wrong is not None:
+            name, told = f"wrong-{self.args.wrong:g}", f"evaluator, {100 * self.args.wrong:g}% wrong"
+            wrong = in_front(self.wrong_evaluator(self.args.wrong), policy)
+            print(f"seed {self.seed}, {name}: {wrong_rate(wrong, self.demonstrations()[:]):.3f} wrong", flush=True)
+            yield told, self.success(name, wrong)
+            for anchor in self.args.anchors:
+                begun = in_front(self.wrong_evaluator(self.args.wrong), self.policy())
+                file = f"{name}-tuned-{anchor:g}"
+                yield f"{told}, tuned, anchor {anchor:g}", self.success(file, self.tuned(file, begun, anchor))
+            begun = in_front(self.wrong_evaluator(self.args.wrong), self.policy().requires_grad_(False))
+            tuned = self.tuned(f"{name}-tuned-alone", begun, 0.0)
+            yield f"{told}, tuned, the policy fixed", self.success(f"{name}-tuned-alone", tuned)
 
 
-def table(found: dict[str, list[EvaluationResult]]) -> str:
+def table(found: dict[tuple[str, str], list[EvaluationResult]]) -> str:
     """A line for each kind of answers: mean over the seeds, and the difference from exact ones, seed by seed."""
-    exact = np.array([result.mean_success for result in found["query answering function"]])
     rows = []
-    for name, results in found.items():
+    for (plans, name), results in found.items():
+        exact = np.array([result.mean_success for result in found[plans, "query answering function"]])
         means = np.array([result.mean_success for result in results])
         by_seed = ", ".join(f"{mean:.3f}" for mean in means)
-        rows.append([name, f"{means.mean():.3f}", by_seed, f"{(means - exact[: len(means)]).mean():+.3f}"])
-    return markdown_table(["answers", "mean", "by seed", "to exact answers"], rows)
+        rows.append([plans, name, f"{means.mean():.3f}", by_seed, f"{(means - exact[: len(means)]).mean():+.3f}"])
+    return markdown_table(["plans", "answers", "mean", "by seed", "to exact answers"], rows)
 
 
 def main(args: Arguments) -> None:
     if args.quick:
-        args = replace(args, tasks=args.tasks[:2], seeds=args.seeds[:1], steps=200, episodes=2)
-    found: dict[str, list[EvaluationResult]] = {}
+        args = replace(args, tasks=args.tasks[:2], seeds=args.seeds[:1], episodes=2)
+        args = replace(args, policy_steps=300, steps=200, tuning_steps=50)
+    found: dict[tuple[str, str], list[EvaluationResult]] = {}
     for seed in args.seeds:
-        for name, result in Bench(args, seed).run():
-            found.setdefault(name, []).append(result)
-            print(f"seed {seed}, {name}: {result.mean_success:.3f}", flush=True)
+        for source in args.plans:
+            for name, result in Bench(args, seed, source).run():
+                found.setdefault((Path(source).stem, name), []).append(result)
+                print(f"seed {seed}, {source}, {name}: {result.mean_success:.3f}", flush=True)
         write_text(args.out / "table.md", table(found))
     print(f"\n{table(found)}\nwritten to {args.out / 'table.md'}")
 
