@@ -107,8 +107,8 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
     if not fallback or any(_role(step).fallback for step in plan.steps):
         return plan
     other = fallback_plan(plan.definition).steps
-    if [(step.condition, step.skill) for step in plan.steps] == [(step.condition, step.skill) for step in other]:
-        return plan
+    if _role(last := other[-1]).verb == "move":
+        other = (*other, _step(last.condition, replace(_role(last), verb="carry")))
     steps = [replace(step, reason="fallback", role=replace(_role(step), fallback=True)) for step in other]
     return replace(plan, steps=(*plan.steps, *steps))
 
@@ -159,14 +159,19 @@ def fallback_plan(task: str | Task) -> ConditionalPlan:
     task = get_task(task)
     held = first_object(task)
     if held is not None:
-        steps = _completed(task, (), StepRole("move", held, GOAL, "grasp", confidence=0.0))
-        return ConditionalPlan(task.name, steps, task)
+        return plan_of_motion(task, StepRole("move", held, GOAL, "grasp", confidence=0.0))
     names = whole_objects(task)
     goal = next((name for name in names if is_goal(task, name)), None)
     # Without an object and without a named goal, the first named place is the target.
     near, target = _gripper_is("near", goal or names[0]), GOAL if goal else names[0]
     approach = _step(_negated(near), StepRole("reach", GRIPPER, target, "reach"))
     return ConditionalPlan(task.name, (approach, _step(near, StepRole("hold", GRIPPER, target, "reach"))), task)
+
+
+def plan_of_motion(task: str | Task, motion: StepRole) -> ConditionalPlan:
+    """Build the plan with standard conditions that carries out ``motion`` on a task's first object."""
+    task = get_task(task)
+    return ConditionalPlan(task.name, _completed(task, (), motion), task)
 
 
 def _role(step: PlanStep) -> StepRole:

@@ -82,13 +82,18 @@ class TaskIndex:
         return torch.where(nearest == wanted, rows, len(self.tasks))
 
 
+_HANDS = ("approach", "descend", "close", "reach", "hold")
+_TURNS = (("own",), ("reach", "approach"), (*_HANDS, "carry"), ("own",), ("reach", "approach"), (*_HANDS, "move"))
+
+
 class PlanTables:
     """Plans as tensors with one row per task, for transforms, attention and actors.
 
     Attributes:
         index: the index from task ids to the T rows.
         mask: (T, S) bool, true for plan steps, false for padding.
-        turns: (T, 2, S) bool, masks of the plan's own steps and of its fallback steps (its own steps without fallback).
+        turns: (T, 6, S) bool, masks of the steps of each turn, in a cycle: the plan's own; those of the fallback that
+            let go; that carry; the plan's own; that let go; that slide. Without a fallback, always the plan's own.
         skill_index: (T, S) int64, the index of each plan step's skill in ``plans.skills``; 0 for padding.
         number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
     """
@@ -97,15 +102,18 @@ class PlanTables:
         self.index = TaskIndex(plans.task_ids)
         self._problem = f"tasks without a plan in {plans!r}"
         self.mask = torch.zeros(len(plans), plans.num_steps, dtype=torch.bool)
-        self.turns = torch.zeros(len(plans), 2, plans.num_steps, dtype=torch.bool)
+        self.turns = torch.zeros(len(plans), len(_TURNS), plans.num_steps, dtype=torch.bool)
         self.skill_index = torch.zeros(len(plans), plans.num_steps, dtype=torch.int64)
         skill = {text: number for number, text in enumerate(plans.skills)}
         for row, task in enumerate(self.index.tasks):
             steps = plans[task].steps
             self.mask[row, : len(steps)] = True
-            fallback = torch.tensor([step.role is not None and step.role.fallback for step in steps])
-            self.turns[row, 0, : len(steps)] = ~fallback
-            self.turns[row, 1, : len(steps)] = fallback if fallback.any() else ~fallback
+            verbs = [step.role.verb if step.role is not None and step.role.fallback else "own" for step in steps]
+            for turn, used in enumerate(_TURNS):
+                # Files of earlier versions have a fallback without "carry"; it is whole in each of its turns.
+                kept = [verb in used for verb in verbs]
+                kept = kept if used[-1] in verbs else [verb != "own" for verb in verbs]
+                self.turns[row, turn, : len(steps)] = torch.tensor(kept if any(kept) else [True] * len(verbs))
             self.skill_index[row, : len(steps)] = torch.tensor([skill[step.skill] for step in steps])
         numbers = plans.numbers
         self.number = torch.tensor([numbers[task] for task in self.index.tasks])
