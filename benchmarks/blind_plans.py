@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import mujoco
 import numpy as np
@@ -15,16 +14,17 @@ from lw_torchrl.language.canonical import canonical_plan, fallback_plan, plan_of
 from lw_torchrl.language.objects import GOAL, GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.roles import StepRole
-from lw_torchrl.language.tasks import first_object, same_object, whole_objects
+from lw_torchrl.language.tasks import Task, first_object, get_task
 from lw_torchrl.suites.suite import find_suite
 
 Array = NDArray[np.float64]
 Blind = Literal["default", "carried", "chooser"]
+BLIND: tuple[Blind, ...] = get_args(Blind)
 _LEVEL = 0.03  # metres by which a goal may be higher or lower than an object that is slid to it
 _OVER_TABLE = 0.03  # metres above object and goal, where something in between is a wall
 
 
-def blind_plans(how: Blind, tasks: Iterable[str]) -> Plans:
+def blind_plans(how: Blind, tasks: Iterable[str | Task]) -> Plans:
     """Plans for tasks without their texts, each with the fallback that all plans have.
 
     "default" grasps the first object and slides it to the goal; "carried" lifts it first. "chooser" looks at the first
@@ -36,24 +36,27 @@ def blind_plans(how: Blind, tasks: Iterable[str]) -> Plans:
         >>> [step.role.verb for step in blind_plans("chooser", ["push-wall"])["push-wall"].steps][:4]
         ['approach', 'descend', 'close', 'carry']
     """
-    chosen = _choose([*tasks]) if how == "chooser" else dict.fromkeys(tasks, "carry" if how == "carried" else "move")
-    return Plans([canonical_plan(_plan(task, motion), fallback=True) for task, motion in chosen.items()])
+    known = [get_task(task) for task in tasks]
+    names = [task.name for task in known]
+    motions = _choose(names) if how == "chooser" else dict.fromkeys(names, "carry" if how == "carried" else "move")
+    return Plans([canonical_plan(_plan(task, motions[task.name]), fallback=True) for task in known])
 
 
-def _plan(name: str, motion: str) -> ConditionalPlan:
-    plan = fallback_plan(name)
-    held = first_object(plan.definition)
+def _plan(task: Task, motion: str) -> ConditionalPlan:
+    held = first_object(task)
     if held is None:
-        return plan
-    if motion in ("carry", "move"):
-        return plan_of_motion(name, StepRole("carry" if motion == "carry" else "move", held, GOAL, "grasp"))
-    if motion == "press":
-        return plan_of_motion(name, StepRole("push", GRIPPER, held, "press", "down"))
-    return plan_of_motion(name, StepRole("push", GRIPPER, held, "push", "goal"))
+        return fallback_plan(task)
+    roles = {
+        "move": StepRole("move", held, GOAL, "grasp"),
+        "carry": StepRole("carry", held, GOAL, "grasp"),
+        "press": StepRole("push", GRIPPER, held, "press", "down"),
+        "push": StepRole("push", GRIPPER, held, "push", "goal"),
+    }
+    return plan_of_motion(task, roles[motion])
 
 
 def _choose(tasks: list[str]) -> dict[str, str]:
-    """Task to "move", "carry", "push" or "press"."""
+    """Task to its motion: "move", "carry", "push" or "press"."""
     engine: Any = find_suite(tasks).make_engine(tasks, reward="sparse", num_threads=1)
     seen: dict[str, list[str]] = {task: [] for task in tasks}
     for seed in range(3):
@@ -86,7 +89,7 @@ def _motion(observation: Array, model: Any, data: Any, shapes: Shapes) -> str:
 
 def _between(model: Any, data: Any, body: int, at: Array, goal: Array) -> bool:
     """Whether a ray from an object to the goal, both raised a little, meets something else."""
-    start, end = (place + (0.0, 0.0, _OVER_TABLE) for place in (at, goal))
+    start, end = (place + np.array([0.0, 0.0, _OVER_TABLE]) for place in (at, goal))
     geom = np.zeros(1, np.int32)
     for _ in range(10):  # the object's own shapes are passed through
         share = mujoco.mj_ray(model, data, start, end - start, None, 1, -1, geom)

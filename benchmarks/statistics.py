@@ -2,10 +2,10 @@
 
 Every function takes success rates in [0, 1] as an array (seeds, tasks), and the confidence of its interval, in (0, 1).
 Two methods have the same tasks in the same order; their seeds are not paired, and may differ in number. Intervals are
-Student's t over the seeds; the tasks stay the same. Only :func:`mean_over_tasks` also draws tasks. The standard error is the jackknife's over seeds, for a mean the
-usual one. Two methods' errors add as in Welch's test. A few seeds give wide intervals: with three, t is 4.3 standard
-errors. In simulation (20 tasks, 20 episodes) the 95 % interval holds the true mean in 0.95 of the cases for 3, 5 and 20
-seeds.
+Student's t over the seeds; the tasks stay the same (only :func:`mean_over_tasks` also draws tasks). The standard error
+is the jackknife's over seeds, for a mean the usual one. Two methods' errors add as in Welch's test. A few seeds give
+wide intervals: with three, t is 4.3 standard errors. In simulation (20 tasks, 20 episodes) the 95 % interval holds the
+true mean in 0.95 of the cases for 3, 5 and 20 seeds.
 
 Source: Agarwal et al. 2021, 'Deep Reinforcement Learning at the Edge of the Statistical Precipice', for the statistics;
 Tukey 1958 for the jackknife with Student's t.

@@ -27,8 +27,9 @@ class FallbackTurns(Transform):
     """A transform that counts the turns of an episode: the plan, letting go, carrying; the plan, letting go, sliding.
 
     A turn ends when neither the hand nor an object has moved farther than ``still`` for ``patience`` time steps, and
-    after at most ``longest`` time steps; a turn that lets go lasts ``release`` time steps. :class:`~lw_torchrl.modules.PlanAttention` reads the turn if the plans have
-    fallback steps, see :func:`~lw_torchrl.canonical_plans`.
+    after at most ``longest`` time steps; a turn that lets go lasts ``release`` time steps.
+    :class:`~lw_torchrl.modules.PlanAttention` reads the turn if the plans have fallback steps, see
+    :func:`~lw_torchrl.canonical_plans`.
 
     In an environment, the transform reads ``observation`` (B, 39) float32, metres, and writes ``turn`` (B,) int64, from
     0. Rows of a replay buffer keep the recorded ``turn``; rows without ``turn`` get 0.
@@ -96,9 +97,7 @@ class FallbackTurns(Transform):
         now, (turn, waited, lasted, stood) = self._positions(next_tensordict), self._rows
         moved = ((now - stood).norm(dim=-1) > self.still).any(-1)
         waited, lasted = torch.where(moved, 0, waited + 1), lasted + 1
-        over = torch.where(
-            turn % 3 == 1, lasted >= self.release, (waited >= self.patience) | (lasted >= self.longest)
-        )
+        over = torch.where(turn % 3 == 1, lasted >= self.release, (waited >= self.patience) | (lasted >= self.longest))
         stood = torch.where((moved | over)[..., None, None], now, stood)
         after = _Rows(turn + over, torch.where(over, 0, waited), torch.where(over, 0, lasted), stood)
         return self._keep(next_tensordict, after, tensordict.get("_step", None))
