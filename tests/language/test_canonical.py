@@ -275,14 +275,14 @@ def test_canonical_plans_are_not_parsed_again():
 def test_the_fallback_plan_follows_the_steps_of_the_plan():
     own = canonical_plan(OWN["dial-turn"])
     assert DIAL.steps[: len(own.steps)] == own.steps
-    assert [step.role.fallback for step in DIAL.steps] == [False] * len(own.steps) + [True] * 4
-    assert [step.role.verb for step in DIAL.steps[-4:]] == ["approach", "descend", "close", "move"]
+    assert [step.role.fallback for step in DIAL.steps] == [False] * len(own.steps) + [True] * 5
+    assert [step.role.verb for step in DIAL.steps[-5:]] == ["approach", "descend", "close", "move", "carry"]
 
 
-def test_the_fallback_plan_has_no_fallback():
+def test_the_fallback_plan_also_has_a_fallback():
     wrong = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "ponder")])
     plan = canonical_plan(wrong, fallback=True)
-    assert not any(step.role.fallback for step in plan.steps)
+    assert [step.role.fallback for step in plan.steps] == [False] * 4 + [True] * 5
     assert plan.confidence == 0.0
 
 
