@@ -25,7 +25,7 @@ from benchmarks.finding_points import find_points
 from benchmarks.statistics import mean_over_tasks
 from lw_torchrl._util.files import read_json, write_json, write_text
 from lw_torchrl.evaluation.result import wilson_interval
-from lw_torchrl.language.canonical import canonical_like, fallback_plan, most_confident
+from lw_torchrl.language.canonical import canonical_like, fallback_plan
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules import plans_of, with_plans
 from lw_torchrl.training import load_evaluator
@@ -170,7 +170,7 @@ def required(path: Path | None, name: str) -> Path:
 
 
 def of_models(file: Path, seed: int) -> Iterator[tuple[str, Plans]]:
-    """For each model and format, one answer a task drawn blindly, and the one that is trusted most."""
+    """For each model and format, one answer a task, drawn blindly."""
     listed: dict[tuple[str, str], dict[str, list[ConditionalPlan | None]]] = {}
     for line in file.read_text("utf-8").splitlines():
         one = json.loads(line)
@@ -180,12 +180,8 @@ def of_models(file: Path, seed: int) -> Iterator[tuple[str, Plans]]:
     for (model, form), tasks in sorted(listed.items()):
         drawn = random.Random(f"{model} {form} {seed}")
         blind = {task: drawn.choice(plans) for task, plans in sorted(tasks.items())}
-        read = {task: [plan for plan in plans if plan is not None] for task, plans in tasks.items()}
-        best = {task: most_confident(plans) if plans else None for task, plans in read.items()}
-        for how, chosen in (("one drawn", blind), ("most trusted of five", best)):
-            # A model that wrote nothing readable leaves the policy with the default plan.
-            plans = [plan or fallback_plan(task) for task, plan in chosen.items()]
-            yield f"{model}, {form}, {how}", Plans(plans)
+        # A model that wrote nothing readable leaves the policy with the default plan.
+        yield f"{model}, {form}", Plans([plan or fallback_plan(task) for task, plan in blind.items()])
 
 
 WORDS = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any, Literal
@@ -32,8 +32,8 @@ from lw_torchrl.language.tasks import (
     whole_objects,
 )
 
-MIN_CONFIDENCE = 0.75
-"""The minimum confidence at which a plan keeps its own conditions."""
+MIN_COVERAGE = 0.75
+"""The minimum fraction of typical states that a plan must cover to keep its own conditions."""
 Source = Literal["plan", "completed", "fallback"]
 _SOURCES = {"plan": "its own steps", "completed": "completed", "fallback": "replaced by the fallback plan"}
 
@@ -58,21 +58,18 @@ class CanonicalReport:
         """Return a JSON row for each step of ``written``, then one for each step that replaces the plan's own.
 
         The keys are ``written`` (None for an added step); ``skill``, ``verb``, ``moved``, ``target`` and ``condition``
-        (None for a step that was left out); ``confidence``; and ``seen``, whether policies see the step.
+        (None for a step that was left out); and ``seen``, whether policies see the step.
         """
 
         def note(step: PlanStep, seen: bool) -> dict[str, Any]:
             role = _role(step)
             parsed = {"skill": step.skill, "verb": role.verb, "moved": role.moved, "target": role.target}
-            rest = {"condition": str(step.condition), "confidence": role.confidence, "seen": seen}
-            return {"written": role.written or None, **parsed, **rest}
+            return {"written": role.written or None, **parsed, "condition": str(step.condition), "seen": seen}
 
         is_own, read = self.source == "plan", iter(self.read)
         nothing = dict.fromkeys(("skill", "verb", "moved", "target", "condition"))
         return [
-            note(next(read), is_own)
-            if is_read
-            else {"written": step.skill, **nothing, "confidence": 0.0, "seen": False}
+            note(next(read), is_own) if is_read else {"written": step.skill, **nothing, "seen": False}
             for step, is_read in zip(self.written.steps, self.is_read, strict=True)
         ] + [note(step, True) for step in self.plan.steps if not is_own]
 
@@ -89,8 +86,8 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
 
     Args:
         plan: a plan in free-form English.
-        fallback: append the steps of the fallback plan, with ``fallback=True`` in their roles. Policies try these steps
-            when the plan makes no progress. A plan that has a fallback, or is the fallback plan, is unchanged.
+        fallback: append the steps of the fallback plan, with ``fallback=True`` in their roles: policies try these steps
+            when the plan makes no progress, and carry or slide the object in turn. A plan that has them is unchanged.
 
     Example:
         >>> import lw_torchrl as lw
@@ -107,8 +104,11 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
     if not fallback or any(_role(step).fallback for step in plan.steps):
         return plan
     other = fallback_plan(plan.definition).steps
-    if _role(last := other[-1]).verb == "move":
-        other = (*other, _step(last.condition, replace(_role(last), verb="carry")))
+    if _role(slide := other[-1]).verb == "move":
+        carry = _step(slide.condition, replace(_role(slide), verb="carry"))
+        verbs = {_role(step).verb for step in plan.steps}
+        slid = "move" in verbs or verbs.isdisjoint(("carry", "push", "pull"))
+        other = (*other[:-1], carry, slide) if slid else (*other, carry)  # first the motion that the plan did not try
     steps = [replace(step, reason="fallback", role=replace(_role(step), fallback=True)) for step in other]
     return replace(plan, steps=(*plan.steps, *steps))
 
@@ -127,14 +127,14 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
         >>> import lw_torchrl as lw
         >>> written = [("gripper is open", "place the gripper above the mug"), ("gripper is closed", "ponder")]
         >>> report = explain_canonical(lw.ConditionalPlan.from_pairs("coffee-push", written))
-        >>> report.source, report.plan.confidence, report.left_out
-        ('fallback', 0.0, ('ponder',))
+        >>> report.source, report.left_out
+        ('fallback', ('ponder',))
     """
     task, parsed = plan.definition, parse_steps(plan)
     read = _with_roles(plan, parsed)
-    confidence, motion = _confidence(task, read), _final_motion(read)
+    motion = _final_motion(read)
     source: Source
-    if confidence >= MIN_CONFIDENCE and _is_complete(read):
+    if _is_complete(read) and _covered(task, read) >= MIN_COVERAGE:
         source, steps = "plan", read
     elif motion is not None:
         source, steps = "completed", _completed(task, read, motion)
@@ -144,10 +144,10 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     explained = []
     for number, step in enumerate(steps):
         written = _role(step).written
-        reasons = [f"confidence {confidence:.2f}, {_SOURCES[source]}"] if number == 0 else []
+        reasons = [_SOURCES[source]] if number == 0 else []
         reasons += [f"as written: {written}"] if written and written != step.skill else []
         explained.append(replace(step, reason="; ".join(reasons)))
-    canonical = ConditionalPlan(plan.task, tuple(explained), task, confidence)
+    canonical = ConditionalPlan(plan.task, tuple(explained), task)
     return CanonicalReport(plan, canonical, source, read, left_out, tuple(map(_has_role, parsed)))
 
 
@@ -389,7 +389,7 @@ def _has_sides(roles: Sequence[StepRole]) -> bool:
     return len(sides) > 1 and all(any(role.target == side and role.verb in BY_HAND for role in roles) for side in sides)
 
 
-def _confidence(task: Task, steps: Sequence[PlanStep]) -> float:
+def _covered(task: Task, steps: Sequence[PlanStep]) -> float:
     """Return the fraction of typical states of the plan's motion in which the active steps do what the motion needs."""
     roles = [_role(step) for step in steps]
     motion = motion_of(roles)
@@ -472,18 +472,6 @@ def _is_true(clause: Clause, task: Task, state: _Floats) -> bool:
         value, threshold = np.sqrt((d * d).sum()) if part.length else d[0], np.float32(part.threshold)
         truth &= bool({"<": value < threshold, ">": value > threshold, "<=": value <= threshold}[part.sense])
     return truth != clause.negated
-
-
-def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
-    """Return a sort key for plans of a task: (has a motion, confidence of the plan, mean confidence of the steps)."""
-    report = explain_canonical(plan)
-    steps = sum(_role(step).confidence for step in report.read) / (len(report.read) + len(report.left_out))
-    return report.source != "fallback", report.plan.confidence or 0.0, steps
-
-
-def most_confident(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
-    """Return the plan with the largest :func:`worth`; the first such plan if several tie."""
-    return max(plans, key=worth)
 
 
 def canonical_like(plans: Plans, reference: Plans | None) -> Plans:

@@ -82,10 +82,6 @@ class TaskIndex:
         return torch.where(nearest == wanted, rows, len(self.tasks))
 
 
-_HANDS = ("approach", "descend", "close", "reach", "hold")
-_TURNS = (("own",), ("reach", "approach"), (*_HANDS, "carry"), ("own",), ("reach", "approach"), (*_HANDS, "move"))
-
-
 class PlanTables:
     """Plans as tensors with one row per task, for transforms, attention and actors.
 
@@ -93,7 +89,7 @@ class PlanTables:
         index: the index from task ids to the T rows.
         mask: (T, S) bool, true for plan steps, false for padding.
         turns: (T, 6, S) bool, masks of the steps of each turn, in a cycle: the plan's own; those of the fallback that
-            let go; that carry; the plan's own; that let go; that slide. Without a fallback, always the plan's own.
+            let go; with its first motion; the plan's own; that let go; with its second. Without a fallback, all steps.
         skill_index: (T, S) int64, the index of each plan step's skill in ``plans.skills``; 0 for padding.
         number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
     """
@@ -102,18 +98,19 @@ class PlanTables:
         self.index = TaskIndex(plans.task_ids)
         self._problem = f"tasks without a plan in {plans!r}"
         self.mask = torch.zeros(len(plans), plans.num_steps, dtype=torch.bool)
-        self.turns = torch.zeros(len(plans), len(_TURNS), plans.num_steps, dtype=torch.bool)
+        self.turns = torch.zeros(len(plans), 6, plans.num_steps, dtype=torch.bool)
         self.skill_index = torch.zeros(len(plans), plans.num_steps, dtype=torch.int64)
         skill = {text: number for number, text in enumerate(plans.skills)}
         for row, task in enumerate(self.index.tasks):
             steps = plans[task].steps
             self.mask[row, : len(steps)] = True
-            verbs = [step.role.verb if step.role is not None and step.role.fallback else "own" for step in steps]
-            for turn, used in enumerate(_TURNS):
-                # Files of earlier versions have a fallback without "carry"; it is whole in each of its turns.
-                kept = [verb in used for verb in verbs]
-                kept = kept if used[-1] in verbs else [verb != "own" for verb in verbs]
-                self.turns[row, turn, : len(steps)] = torch.tensor(kept if any(kept) else [True] * len(verbs))
+            back = {n: step.role.verb for n, step in enumerate(steps) if step.role is not None and step.role.fallback}
+            own = [n for n in range(len(steps)) if n not in back]
+            let_go = [n for n, verb in back.items() if verb in ("approach", "reach")]
+            motions = [n for n, verb in back.items() if verb in ("carry", "move")]  # one in files of earlier versions
+            first, second = ([n for n in back if n not in other] for other in (motions[1:], motions[:-1]))
+            for turn, numbers in enumerate((own, let_go, first, own, let_go, second)):
+                self.turns[row, turn, numbers or own] = True
             self.skill_index[row, : len(steps)] = torch.tensor([skill[step.skill] for step in steps])
         numbers = plans.numbers
         self.number = torch.tensor([numbers[task] for task in self.index.tasks])

@@ -24,7 +24,7 @@ class _Rows(NamedTuple):
 
 
 class FallbackTurns(Transform):
-    """A transform that counts the turns of an episode: the plan, letting go, carrying; the plan, letting go, sliding.
+    """A transform that counts the turns of an episode: the plan, letting go, one motion; the plan, letting go, another.
 
     A turn ends when neither the hand nor an object has moved farther than ``still`` for ``patience`` time steps, and
     after at most ``longest`` time steps; a turn that lets go lasts ``release`` time steps.

@@ -131,10 +131,10 @@ APPROACH, HELD = {"approach"}, {"approach", "descend", "close"}
 
 @pytest.mark.parametrize(
     ("turn", "verbs"),
-    [(None, ()), (0, ()), (1, APPROACH), (2, {*HELD, "carry"}), (3, ()), (4, APPROACH), (11, {*HELD, "move"})],
+    [(None, ()), (0, ()), (1, APPROACH), (2, {*HELD, "move"}), (3, ()), (4, APPROACH), (11, {*HELD, "carry"})],
 )
 def test_fallback_steps_have_their_own_turns(turn, verbs):
-    """The plan, letting go, carrying; the plan, letting go, sliding; and so on."""
+    """The plan, which carries; letting go, sliding; the plan, letting go, carrying; and so on."""
     plans = lw.canonical_plans(lw.load_plans("MT10"), fallback=True)
     attention = PlanAttention(plans)
     assert attention.in_keys == ["qaf", "task_id", "turn"]
