@@ -24,7 +24,12 @@ def __getattr__(name: str) -> object:
     if name in _ROOM_OF:
         found = globals()[name] = getattr(import_module(_ROOM_OF[name]), name)
         return found
-    raise AttributeError(f"module 'lw_torchrl' has no attribute {name!r}")
+    verb = name.partition("_")[0]
+    similar = [
+        known for known in __all__ if known.partition("_")[0] == verb
+    ]
+    hint = f"; similar names: {', '.join(similar)}" if similar else ""
+    raise AttributeError(f"module 'lw_torchrl' has no attribute {name!r}{hint}")
 
 
 def __dir__() -> list[str]:

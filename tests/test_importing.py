@@ -136,3 +136,9 @@ def test_names_and_rooms_are_attributes():
         lw_torchrl.load_plan  # noqa: B018
     rooms = {module.name for module in pkgutil.iter_modules(lw_torchrl.__path__) if module.ispkg}
     assert {*lw_torchrl._ROOMS, "cli", "_util"} == rooms
+
+
+def test_an_unknown_name_lists_names_with_the_same_verb():
+    with pytest.raises(AttributeError, match=r"'load_policy'.*load_actor"):
+        _ = lw_torchrl.load_policy
+    assert not hasattr(lw_torchrl, "frobnicate")

@@ -26,7 +26,7 @@ from lw_torchrl.suites.suite import Suite
 def evaluate(
     actor: TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase],
     *,
-    tasks: str | Task | Iterable[str | Task],
+    tasks: str | Task | Iterable[str | Task] | None = None,
     plans: AnyPlans | None = None,
     episodes_per_task: Count = 20,
     seed: int,
@@ -58,7 +58,8 @@ def evaluate(
     Args:
         actor: a policy that reads ``observation``, ``task_id`` and, if it has plans, ``qaf``, and writes ``action``
             (N, 4) float32.
-        tasks: see :func:`resolve_tasks`; if the actor lists its tasks, a subset of that list.
+        tasks: see :func:`resolve_tasks`; if the actor lists its tasks, a subset of that list. None for all of the
+            actor's tasks, or the tasks of its plans.
         plans: the plans whose conditions are evaluated into ``qaf``; None for the actor's plans.
         episodes_per_task: the number k of episodes.
         seed: random seed (use a different one than for the demonstrations).
@@ -97,12 +98,13 @@ def evaluate(
 
     Source: paper section 'Conditional Plan Experiments': 20 episodes, action noise 0.1.
     """
-    answered = actor_plans(actor, plans)
+    answered, known = actor_plans(actor, plans), tasks_of(actor)
+    if tasks is None and (tasks := known or answered) is None:
+        raise ValueError("tasks is required: the actor has neither tasks nor plans; pass tasks='MT10', for example")
     own_suite, chosen = suite_tasks(tasks, answered, suite)
     names = tuple(chosen)
     if answered is not None:
         answered.require(names)
-    known = tasks_of(actor)
     if known is not None and (other := ", ".join(task for task in names if task not in known)):
         raise ValueError(f"tasks must be among the actor's tasks ({', '.join(known)}), got {other}")
     if attribute and answered is None:

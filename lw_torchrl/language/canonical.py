@@ -321,11 +321,13 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
             motion = replace(motion, moved=moved)
         if motion.verb == "move" and steps and any(map(is_obstacle, task.object_names)):
             motion = replace(motion, verb="carry")
-        held = Query((*near.clauses, *_gripper_is("closed").clauses))
+        # Around a wide object fingers are never closed. A layout with its own threshold knows its objects.
+        opened = _gripper_is("open" if "open" in task.layout.thresholds else "wide open")
+        held = Query((*near.clauses, *_negated(opened).clauses))
         return (
             by_hand("approach", "grasp", _negated(above), away),
             by_hand("descend", "grasp", above, away),
-            by_hand("close", "grasp", near, _gripper_is("open")),
+            by_hand("close", "grasp", near, opened),
             *(_own_motions(task, steps, held) or [_step(held, motion)]),
         )
     way, motion = motion.direction, replace(motion, target=point)

@@ -75,7 +75,8 @@ _OF_POSITION: Mapping[str, tuple[Comparison, ...]] = MappingProxyType(_predicate
 STATES = Registry("state", "lw_torchrl.states", _predicates("states"), _check_state)
 """The states of an opening, from 0 (closed) to 1 (open); their comparisons use the opening as z.
 
-The shipped states are "open" and "closed"; add a state with ``STATES["on"] = STATES["open"]``.
+The shipped states are "open", "closed" and "wide open"; fingers around a wide object are neither closed nor wide open.
+Add a state with ``STATES["on"] = STATES["open"]``.
 """
 UNARY = ChainMap[str, tuple[Comparison, ...]](STATES, _OF_POSITION)  # type: ignore[arg-type]
 """Predicates of a single object: "touching the table" (based on the object's z) and the states of its opening."""

@@ -204,6 +204,8 @@ def check_task(name: object, tasks: Tasks = TASKS) -> str:
 
 def _unknown_task(argument: str, name: str, tasks: Tasks) -> ValueError:
     """Build the error for an unknown task name, with a hint about custom tasks if only the 50 tasks are known."""
+    if "," in name and all(part in tasks for part in re.split(r",\s*", name)):
+        return ValueError(f"{argument} must be separate names, got {name!r}; use spaces in a shell, a list in Python")
     error = unknown_name(argument, name, tasks if argument == "task" else (*_SETS, *tasks))
     if tasks is not TASKS:
         return error

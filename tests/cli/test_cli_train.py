@@ -147,6 +147,7 @@ def test_missing_files_and_unsuitable_policies_are_errors(capsys, demos, trained
     assert not (tmp_path / "x.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_train_evaluator_writes_an_evaluator_and_a_report(capsys, tmp_path):
     out, policy = tmp_path / "evaluator", tmp_path / "scripted.safetensors"
     plans = lw.load_plans("MT10")

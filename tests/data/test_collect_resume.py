@@ -87,6 +87,7 @@ KILLER = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["replace", pytest.param("seed 1", marks=pytest.mark.slow)])
 def test_repeated_kills_do_not_change_the_dataset(dataset, tmp_path, mode):
     root = tmp_path / "demos"

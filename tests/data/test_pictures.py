@@ -81,6 +81,7 @@ def test_rows_between_pictures_have_the_earlier_one(root):
     assert sum(len(zipfile.ZipFile(file).namelist()) for file in files(root)[:1]) in (2, 12)
 
 
+@pytest.mark.slow
 def test_a_killed_call_is_resumed(root, monkeypatch):
     shutil.rmtree(root / "pictures")
     kept, written = pictures._write, []

@@ -128,6 +128,7 @@ def kill_after_two_batches(kind, file):
     return left["state"], set(left["seen"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["one", *(pytest.param(k, marks=pytest.mark.slow) for k in ("sync", "async", "ray"))])
 def test_a_killed_collector_resumes_with_the_next_episodes(kind, tmp_path):
     if kind == "ray":

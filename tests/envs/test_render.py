@@ -213,6 +213,7 @@ def test_an_open_environment_ends_without_output():
     assert not done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", first_fast(["glfw", "disable"]))
 def test_the_error_without_opengl_names_what_to_install(backend):
     environment = {**os.environ, "MUJOCO_GL": backend}

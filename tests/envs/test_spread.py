@@ -74,6 +74,7 @@ def test_parts_hold_few_tasks():
 # ---- the same bits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -90,6 +91,7 @@ def test_the_number_of_workers_changes_no_byte_of_a_dataset(options, tmp_path):
     assert tree(tmp_path / "2") == tree(tmp_path / "3") == tree(tmp_path / "1")
 
 
+@pytest.mark.slow
 def test_the_number_of_workers_changes_no_bit_of_a_result(tmp_path):
     torch.manual_seed(0)
     actor = lw.PlanConditionedActor(PLANS)
@@ -173,6 +175,7 @@ def test_functions_stay_in_this_process_unless_workers_is_given(monkeypatch, tmp
     assert len(calls) == 6
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard_runs_once(tmp_path):
     """The policy's class is the script's own, and workers do not import the script."""
     script = tmp_path / "script.py"
@@ -269,6 +272,7 @@ PROGRAM = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_no_worker_survives_this_process(number, tmp_path):
     """Ctrl-C reaches all processes of a terminal, and only this one prints a traceback."""
@@ -282,6 +286,7 @@ def test_no_worker_survives_this_process(number, tmp_path):
     assert error.count("Traceback") == (number == signal.SIGINT), error
 
 
+@pytest.mark.slow
 def test_an_interrupted_collection_resumes_with_the_same_bytes(tmp_path):
     how = dict(episodes_per_task=4, seed=5, max_steps=100, progress=False)
     expected = collect_demonstrations(TASKS, root=tmp_path / "whole", workers=1, **how)

@@ -38,6 +38,7 @@ BATCHED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [make_env, make_transformed])
 @pytest.mark.parametrize("name", first_fast(BATCHED, 2))
 def test_a_batch_of_environments_runs_the_episodes_of_a_large_one(name, make):

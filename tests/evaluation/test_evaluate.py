@@ -306,6 +306,13 @@ def test_a_task_without_a_plan_is_refused():
         run(lambda state: state, "push", plans={"reach": PLANS["reach"]})
 
 
+def test_the_actors_tasks_or_else_its_plans_are_the_default():
+    assert set(run(ExpertActor(["push", "reach"]), None).success_once) == {"push", "reach"}
+    assert set(run(make_actor(), None, episodes_per_task=1).success_once) == set(PLANS)
+    with pytest.raises(ValueError, match="tasks is required"):
+        run(lambda state: state, None)
+
+
 # ---- refused
 
 

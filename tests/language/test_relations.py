@@ -17,7 +17,7 @@ from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, TOUCHING, UNARY, Comparison
+from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, STATES, TOUCHING, UNARY, Comparison
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
 
 # Every relation as (value, sense, threshold) on d = first - second in metres, from the published semantics.
@@ -53,7 +53,7 @@ def moved(position, displacement):
 
 def test_the_relations_are_the_thirteen_published_ones():
     assert set(RELATIONS) == set(FORMULAS)
-    assert set(UNARY) == {TOUCHING, "open", "closed"}
+    assert set(UNARY) == {TOUCHING, "open", "closed", "wide open"}
     assert set(PREDICATES) == set(RELATIONS) | set(UNARY)
 
 
@@ -115,7 +115,7 @@ def test_the_page_on_queries_has_every_threshold():
     table = page[page.index("| predicate | holds where |") :].split("\n\n")[0]
     rows = dict(re.findall(r"^\| ([a-z ]+) \| ([^|]+) \|$", table, re.MULTILINE))
     for name, parts in PREDICATES.items():
-        assert rows.pop(name) == " and ".join(written(part, name in ("open", "closed")) for part in parts)
+        assert rows.pop(name) == " and ".join(written(part, name in STATES) for part in parts)
     assert rows == {"predicate": "holds where"}  # the heading
 
 

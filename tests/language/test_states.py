@@ -68,12 +68,14 @@ def test_a_layout_s_own_threshold_counts():
 
 def test_states_are_listed_and_in_prompts():
     asked = supported_queries(HOUSE)
-    assert asked[-6:-2] == tuple(f"the {thing} is {state}" for thing in THINGS for state in ("open", "closed"))
-    assert not {*asked[-6:-2]} & {*supported_queries(HOUSE, published_only=True)}
+    states = ("open", "closed", "wide open")
+    assert asked[-8:-2] == tuple(f"the {thing} is {state}" for thing in THINGS for state in states)
+    assert not {*asked[-8:-2]} & {*supported_queries(HOUSE, published_only=True)}
     assert str(nearest_query("the dor is opn", HOUSE).query) == "the door is open"
-    told = "or that the robot's gripper or door or light switch is open or closed. Several conditions"
+    told = "or that the robot's gripper or door or light switch is open or closed or wide open. Several conditions"
     assert told in plan_prompt(HOUSE, "basic_py", vocabulary=True)
-    assert "or that the robot's gripper is open or closed. Several" in plan_prompt("push", "basic_py", vocabulary=True)
+    told = "or that the robot's gripper is open or closed or wide open. Several"
+    assert told in plan_prompt("push", "basic_py", vocabulary=True)
 
 
 def test_a_custom_state_is_a_predicate_of_objects_with_an_opening(monkeypatch):
@@ -93,7 +95,7 @@ def test_a_custom_state_is_a_predicate_of_objects_with_an_opening(monkeypatch):
     assert truth.T.tolist() == [[False, True, True, False], [True, False, False, True], [False, False, False, True]]
     with pytest.raises(QueryError, match=r"the cup .only the gripper and the door and the light switch can be"):
         parse_query("the cup is on", HOUSE)
-    with pytest.raises(QueryError, match="only the gripper can be open or closed or on or ajar"):
+    with pytest.raises(QueryError, match="only the gripper can be open or closed or wide open or on or ajar"):
         parse_query("the puck is ajar", "push")
 
 
@@ -110,8 +112,8 @@ def test_a_custom_state_is_a_predicate_of_objects_with_an_opening(monkeypatch):
 def test_a_faulty_state_is_refused(name, parts, message):
     with pytest.raises(ValueError, match=message):
         STATES[name] = parts
-    assert [*STATES] == ["open", "closed"]
-    assert [*PREDICATES][-3:] == ["touching the table", "open", "closed"]
+    assert [*STATES] == ["open", "closed", "wide open"]
+    assert [*PREDICATES][-4:] == ["touching the table", "open", "closed", "wide open"]
 
 
 def test_openings_are_written_and_read_again():

@@ -67,6 +67,7 @@ def test_the_words_of_shipped_plans_are_known(skills):
             assert simplify(marked) == marked
 
 
+@pytest.mark.slow
 def test_nine_of_ten_paraphrases_have_the_same_meaning():
     same, unread = [], 0
     for plan in OWN.values():

@@ -135,6 +135,7 @@ def test_resolve_tasks_accepts_a_set_a_name_or_names(names, expected):
         ("mt10", ValueError, ["'MT10'"]),
         (["reach", "drawer-opne"], ValueError, ["'drawer-opne'", "'drawer-open'"]),
         (["MT10"], ValueError, ["'MT10'"]),
+        ("push, reach", ValueError, ["'push, reach'", "spaces", "list"]),
         (["push", "reach", "push"], ValueError, ["once", "push"]),
         ([], ValueError, ["at least one task"]),
         ([None], TypeError, ["None"]),

@@ -59,6 +59,7 @@ print(json.dumps(actions))
 """
 
 
+@pytest.mark.slow
 def test_custom_parts_are_trained_saved_and_loaded_in_a_new_process(tmp_path):
     expected, batch = {}, make_batch()
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(len(batch)), batch_size=8)

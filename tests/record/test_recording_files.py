@@ -78,6 +78,7 @@ with new_recording(sys.argv[1]) as logger:
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_keeps_the_old_recording(tmp_path):
     path = tmp_path / "a.rrd"
     assert run_script(FILLED, path, 2**30).wait(120) == 0
@@ -117,6 +118,7 @@ def test_finishing_the_experiment_shuts_the_logger_down(tmp_path):
     assert losses(tmp_path / "a.rrd") == [1.0]
 
 
+@pytest.mark.slow
 def test_a_logger_shuts_down_when_the_process_exits(tmp_path):
     script = "from lw_torchrl.record import RerunLogger\nRerunLogger(sys.argv[1]).log_scalar('loss', 1.0)"
     assert run_script(script, tmp_path / "a.rrd").wait(120) == 0
@@ -136,6 +138,7 @@ for number in range(10**6):
 """
 
 
+@pytest.mark.slow
 def test_a_killed_run_leaves_a_readable_recording(tmp_path):
     path = tmp_path / "a.rrd"
     process = run_script(KILLED, path)
@@ -173,6 +176,7 @@ assert longest < 3, longest
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_loses_the_end_of_the_recording_but_does_not_stop_the_program(tmp_path):
     path = tmp_path / "a.rrd"
     assert run_script(FULL, path).wait(120) == 0

@@ -38,6 +38,7 @@ def test_rerun_logger_behaves_as_a_torchrl_logger(tmp_path):
         logger.log_scalar("loss", 1.0)
 
 
+@pytest.mark.slow
 def test_scalars_are_read_back(tmp_path):
     with RerunLogger(tmp_path / "a.rrd", exp_name="run") as logger:
         for i in range(3000):
@@ -191,6 +192,7 @@ def test_episodes_of_several_threads_have_different_names(tmp_path):
     assert sorted(names) == sorted({"reach", *(f"reach-{number}" for number in range(2, 25))})
 
 
+@pytest.mark.slow
 def test_importing_the_package_does_not_import_rerun():
     code = "import sys, lw_torchrl.record; sys.exit('rerun' in sys.modules or 'rerun_bindings' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -70,6 +70,7 @@ def test_missing_or_unreadable_recordings_and_unknown_episodes_are_errors(tmp_pa
             open_viewer(tmp_path / "b.rrd")
 
 
+@pytest.mark.slow
 def test_web_viewer_is_served_on_this_machine_until_interrupted(tmp_path):
     path = write(tmp_path / "a.rrd")
     code = f"from lw_torchrl.record import open_viewer; open_viewer({str(path)!r}, episode='Metrics', web_port=0)"

@@ -43,6 +43,7 @@ def make_trainer(replay, path=None, config=CONFIG, **options):
     return lw.training.QueryEvaluatorTrainer(make(**options), data, config, checkpoint=path, progress=False)
 
 
+@pytest.mark.slow
 def test_a_policy_with_an_image_evaluator_resumes_bit_for_bit(replay, tmp_path):
     def train(path, stop=None):
         torch.manual_seed(1)

@@ -126,6 +126,7 @@ def interrupted(forks, tmp_path, arguments, runs, owner, method):
     return results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [5, pytest.param(20, marks=pytest.mark.slow)])
 def test_runs_that_are_interrupted_at_random_moments_lose_no_step(forks, demos, tmp_path, times):
     file = tmp_path / "policy.safetensors"

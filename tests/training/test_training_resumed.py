@@ -174,6 +174,7 @@ KILLER = """
 """
 
 
+@pytest.mark.slow
 def test_a_kill_at_any_moment_leaves_a_whole_checkpoint_that_resumes_bit_for_bit(demos, tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     command = [sys.executable, "-W", "ignore", "-c", textwrap.dedent(KILLER), str(demos), str(path)]

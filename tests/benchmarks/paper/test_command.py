@@ -101,6 +101,7 @@ def test_every_row_of_every_offline_table_is_listed(capsys, tmp_path):
     assert names[-3:] == [f"five/C/bc-plan/seed{seed}" for seed in range(3)]
 
 
+@pytest.mark.slow
 def test_command_runs_in_a_process():
     assert "few-shot/strong/dc/seed0" in run_command(["few-shot", "--list"])
     with pytest.raises(RuntimeError, match=r"benchmarks.paper few-shot --run nonsense failed:\n(.*\n)*.*--run must be"):

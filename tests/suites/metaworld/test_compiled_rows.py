@@ -197,6 +197,7 @@ def test_engines_in_two_python_threads_do_not_disturb_each_other(steps):
     assert len(results) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", MAKERS)
 def test_rows_of_an_interrupted_step_must_be_reset(make):
     """Press Ctrl-C at random moments of 30 runs."""

@@ -98,6 +98,7 @@ def test_all_tasks_have_metaworlds_bits(tasks):
     assert succeeded.sum() >= 8, "few successes were compared"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tasks", [SHARING * 2, VARIED], ids=["shared models", "varied tasks"])
 def test_masks_and_resets_in_any_order_have_metaworlds_bits(tasks):
     """Rows that share models, stepped and reset in any mixture by one or two threads, act as if alone."""
