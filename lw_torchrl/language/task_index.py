@@ -109,8 +109,8 @@ class PlanTables:
             let_go = [n for n, verb in back.items() if verb in ("approach", "reach")]
             motions = [n for n, verb in back.items() if verb in ("carry", "move")]  # one in files of earlier versions
             first, second = ([n for n in back if n not in other] for other in (motions[1:], motions[:-1]))
-            for turn, numbers in enumerate((own, let_go, first, own, let_go, second)):
-                self.turns[row, turn, numbers or own] = True
+            for turn, active in enumerate((own, let_go, first, own, let_go, second)):
+                self.turns[row, turn, active or own] = True
             self.skill_index[row, : len(steps)] = torch.tensor([skill[step.skill] for step in steps])
         numbers = plans.numbers
         self.number = torch.tensor([numbers[task] for task in self.index.tasks])
