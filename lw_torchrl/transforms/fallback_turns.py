@@ -48,7 +48,7 @@ class FallbackTurns(Transform):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> import lw_torchrl as lw
-        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.FallbackTurns(patience=5))
+        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.FallbackTurns(patience=5, release=5))
         >>> env.rollout(12, lambda td: td.set("action", td["observation"].new_zeros(1, 4)))["turn"].max()
         tensor(2)
 
