@@ -45,10 +45,8 @@ class Arguments:
     """Number of episodes per task."""
     seed: int = 3000
     """Random seed of the episodes."""
-    max_steps: int = 250
+    max_steps: int = 50
     """Steps of an episode; success at any step counts."""
-    speed: float = 1.5
-    """Scale factor on the metres that Meta-World's hand moves in a step."""
     out: Path = Path("runs/across_robots")
     """Folder for results.json and table.md."""
 
@@ -86,7 +84,7 @@ def main(arguments: Arguments) -> None:
     for method in arguments.methods:
         for seed in arguments.seeds:
             followed = trained(arguments.policies, "pcbc", seed)
-            turner = TransferredActor(followed, canonical_like(plans, plans_of(followed)), speed=arguments.speed)
+            turner = TransferredActor(followed, canonical_like(plans, plans_of(followed)))
             actor = turner if method == "pcbc" else Adapted(trained(arguments.policies, method, seed), turner.converted)
             how: dict[str, Any] = {"tasks": list(TASKS), "episodes_per_task": arguments.episodes}
             how |= {"seed": arguments.seed, "max_steps": arguments.max_steps, "noise_scale": 0.0}

@@ -7,22 +7,25 @@ import json
 import random
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
 
+import numpy as np
 import torch
 import tyro
+from numpy.typing import NDArray
 from tensordict.nn import TensorDictModuleBase
 
 import lw_torchrl as lw
+from benchmarks.blind_plans import BLIND, blind_plans
 from benchmarks.figures import markdown_table
 from benchmarks.finding_points import find_points
-from benchmarks.statistics import mean_difference, mean_rate
+from benchmarks.statistics import mean_over_tasks
 from lw_torchrl._util.files import read_json, write_json, write_text
 from lw_torchrl.evaluation.result import wilson_interval
-from lw_torchrl.language.canonical import canonical_like, explain_canonical, fallback_plan, most_confident
+from lw_torchrl.language.canonical import canonical_like, fallback_plan
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules import plans_of, with_plans
 from lw_torchrl.training import load_evaluator
@@ -38,8 +41,8 @@ TEST = tuple(task for task in lw.MT50 if task not in DEVELOPMENT and task not in
 PARAPHRASES = 10  # of each plan
 OURS, NATURAL = lw.load_plans("MT50", skills="MT10"), lw.load_plans("MT50")
 Rows = Literal[
-    "default", "carried", "ours", "natural", "own-words", "palm2", "no-points", "dc", "one-hot", "no-roles", "models",
-    "programs", "robustness", "evaluator",
+    "default", "carried", "chooser", "ours", "natural", "own-words", "palm2", "no-points", "dc", "one-hot",
+    "no-roles", "models", "programs", "robustness", "evaluator",
 ]  # fmt: skip
 
 
@@ -47,14 +50,15 @@ Rows = Literal[
 class Arguments:
     """Evaluate the zero-shot policies of each training seed under plans of different authors.
 
-    Every row is one evaluation of the same policies, "dc", "one-hot" and "no-roles" of their own. The plan "default" is
-    one for all tasks, grasp the first thing and move it to the goal, by every means that plans have. Rates are of the
-    40 tasks outside MT10, in the development tasks, on which all was chosen, and the test tasks.
+    Every row is one evaluation of the same policies, "dc", "one-hot" and "no-roles" of their own. The plans "default",
+    "carried" and "chooser" read no text: grasp the first thing and slide it to the goal, lift it first, or what
+    geometry tells (benchmarks.blind_plans), by every means that plans have. Rates are of the 40 tasks outside MT10, in
+    the development tasks, on which all was chosen, and the test tasks. Intervals are over tasks and seeds.
     """
 
     policies: tyro.conf.Positional[Path]
     """Folder `strong` of `python -m benchmarks.paper zero-shot`, beside which there is the folder `no-roles`."""
-    rows: tuple[Rows, ...] = ("default", "ours", "natural", "palm2", "dc", "one-hot")
+    rows: tuple[Rows, ...] = (*BLIND, "ours", "natural", "palm2", "dc", "one-hot")
     """Plans to evaluate."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the trained policies."""
@@ -94,8 +98,7 @@ def main(arguments: Arguments) -> None:
                 actor = following(policy, Plans([plans[task] for task in tasks]))
                 how["evaluator"] = load_evaluator(required(arguments.evaluator, "evaluator"), plans_of(actor)).eval()
             result = lw.evaluate(actor, tasks=tasks, seed=fixes, stop_at_success=True, **how)
-            trust = {} if plans is None else {task: explain_canonical(plans[task]).plan.confidence for task in tasks}
-            found[key] = {"row": row, "seed": seed, "success": result.success_once, "trust": trust}
+            found[key] = {"row": row, "seed": seed, "success": result.success_once}
             write_json(file, found)
             print(f"{key}: {result.mean_success:.3f}", flush=True)
     table = report(list(found.values()), arguments.episodes)
@@ -121,8 +124,8 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
             yield row, row, None
         elif row == "no-roles":
             yield row, row, Plans([OURS[task] for task in outside])
-        elif row == "default":
-            yield row, "pcbc", Plans([fallback_plan(task) for task in outside])
+        elif row in BLIND:
+            yield row, "pcbc", blind_plans(row, outside)
         elif row in ("ours", "natural", "evaluator"):
             yield row, "pcbc", Plans([(OURS if row == "ours" else NATURAL)[task] for task in outside])
         elif row == "own-words":  # whole plans of writers who saw the tasks, their things' names and the query language
@@ -137,10 +140,11 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
             for points, tasks in {"no points": bare, "points of shapes": find_points(outside)}.items():
                 written = lw.load_plans(required(arguments.palm2, "palm2"), tasks=lw.TASKS | tasks)
                 yield f"palm2, {points}", "pcbc", Plans([written[task] for task in outside])
-                yield f"default, {points}", "pcbc", Plans([fallback_plan(written[task].definition) for task in outside])
-        elif row == "carried":  # the default plan, but it lifts the object first
-            plans = [fallback_plan(task) for task in outside]
-            yield row, "pcbc", Plans([_carried(plan) for plan in plans])
+                yield (
+                    f"default, {points}",
+                    "pcbc",
+                    blind_plans("default", [written[task].definition for task in outside]),
+                )
         elif row == "programs":  # a text that cannot be read leaves the policy with the default plan
             for style, texts in read_json(required(arguments.programs, "programs"), "programs").items():
                 plans = [lw.decode_plan(text, task).plan or fallback_plan(task) for task, text in texts.items()]
@@ -159,16 +163,6 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
                     yield name, "pcbc", Plans([change(NATURAL[task], drawn) for task in outside])
 
 
-def _carried(plan: ConditionalPlan) -> ConditionalPlan:
-    """Return a fallback plan that carries the object instead of sliding it."""
-    roles = [
-        step.role and replace(step.role, verb="carry" if step.role.verb == "move" else step.role.verb)
-        for step in plan.steps
-    ]
-    steps = [replace(step, skill=role.skill, role=role) for step, role in zip(plan.steps, roles, strict=True) if role]
-    return replace(plan, steps=tuple(steps))
-
-
 def required(path: Path | None, name: str) -> Path:
     if path is None:
         raise ValueError(f"--{name} must name a file for the rows of {name}")
@@ -176,7 +170,7 @@ def required(path: Path | None, name: str) -> Path:
 
 
 def of_models(file: Path, seed: int) -> Iterator[tuple[str, Plans]]:
-    """For each model and format, one answer a task drawn blindly, and the one that is trusted most."""
+    """For each model and format, one answer a task, drawn blindly."""
     listed: dict[tuple[str, str], dict[str, list[ConditionalPlan | None]]] = {}
     for line in file.read_text("utf-8").splitlines():
         one = json.loads(line)
@@ -186,12 +180,8 @@ def of_models(file: Path, seed: int) -> Iterator[tuple[str, Plans]]:
     for (model, form), tasks in sorted(listed.items()):
         drawn = random.Random(f"{model} {form} {seed}")
         blind = {task: drawn.choice(plans) for task, plans in sorted(tasks.items())}
-        read = {task: [plan for plan in plans if plan is not None] for task, plans in tasks.items()}
-        best = {task: most_confident(plans) if plans else None for task, plans in read.items()}
-        for how, chosen in (("one drawn", blind), ("most trusted of five", best)):
-            # A model that wrote nothing readable leaves the policy with the default plan.
-            plans = [plan or fallback_plan(task) for task, plan in chosen.items()]
-            yield f"{model}, {form}, {how}", Plans(plans)
+        # A model that wrote nothing readable leaves the policy with the default plan.
+        yield f"{model}, {form}", Plans([plan or fallback_plan(task) for task, plan in blind.items()])
 
 
 WORDS = {
@@ -291,48 +281,40 @@ CHANGES: dict[str, Callable[[ConditionalPlan, random.Random], ConditionalPlan]] 
 
 
 def report(found: list[dict[str, Any]], episodes: int) -> str:
-    """Markdown: a line for each row, with the pairwise difference to the default plan."""
+    """Markdown: a line for each row, with the difference to the best of the blind plans, in each seed and task."""
     several: dict[str, dict[int, list[dict[str, float]]]] = {}
-    trust: dict[str, list[float]] = {}
     for one in found:
         several.setdefault(one["row"], {}).setdefault(one["seed"], []).append(one["success"])
-        trust.setdefault(one["row"], []).extend(one["trust"].values())
     rows = {
         name: {seed: {task: fmean(one[task] for one in each) for task in each[0]} for seed, each in seeds.items()}
         for name, seeds in several.items()
     }
-    lines = []
-    for name, seeds in rows.items():
-        cells = [name, str(len(seeds))]
-        for tasks in (DEVELOPMENT, TEST):
-            known = [task for task in tasks if all(task in rates for rates in seeds.values())]
-            cells.append(str(mean_rate([[rates[task] for task in known] for rates in seeds.values()])) if known else "")
-        both = sorted({*seeds} & {*rows.get("default", {})})
-        if name != "default" and both:
-            known = [task for task in seeds[both[0]] if task in rows["default"][both[0]]]
-            ours, theirs = ([[of[seed][task] for task in known] for seed in both] for of in (seeds, rows["default"]))
-            better, worse = beyond_chance(ours, theirs, episodes)
-            worse_names = ", ".join(known[number] for number in worse)
-            cells += [str(mean_difference(ours, theirs)), str(len(better)), f"{len(worse)} {worse_names}".strip()]
-        else:
-            cells += ["", "", ""]
-        cells.append(f"{sum(trust[name]) / len(trust[name]):.2f}" if trust[name] else "")
-        lines.append(cells)
-    head = ["plans", "seeds", "20 development tasks", "20 test tasks", "minus default", "better", "worse", "trust"]
+    head, lines = ["plans", "seeds"], [[name, str(len(seeds))] for name, seeds in rows.items()]
+    for kind, tasks in (("development", DEVELOPMENT), ("test", TEST)):
+        blind = {name: _rates(rows[name], tasks).mean() for name in BLIND if name in rows}
+        best = max(blind, key=blind.__getitem__, default="")
+        head += [f"{len(tasks)} {kind} tasks", f"minus {best}" if best else "", "better, worse"]
+        for line, seeds in zip(lines, rows.values(), strict=True):
+            line.append(str(mean_over_tasks(rates)) if (rates := _rates(seeds, tasks)).size else "")
+            both = {seed: rows[best][seed] for seed in seeds if seed in rows[best]} if best not in ("", line[0]) else {}
+            ours, theirs = _rates({seed: seeds[seed] for seed in both}, tasks), _rates(both, tasks)
+            known = bool(both) and ours.size == theirs.size > 0
+            line += [str(mean_over_tasks(ours - theirs)), beyond_chance(ours, theirs, episodes)] if known else ["", ""]
     return markdown_table(head, lines)
 
 
-def beyond_chance(ours: list[list[float]], theirs: list[list[float]], episodes: int) -> tuple[list[int], list[int]]:
-    """The tasks in which the Wilson intervals of the two rates, over all seeds' episodes, do not meet."""
-    better, worse = [], []
-    for number, (one, other) in enumerate(zip(zip(*ours, strict=True), zip(*theirs, strict=True), strict=True)):
-        trials = episodes * len(one)
-        mine, default = (wilson_interval(round(sum(rates) * episodes), trials) for rates in (one, other))
-        if mine[0] > default[1]:
-            better.append(number)
-        elif mine[1] < default[0]:
-            worse.append(number)
-    return better, worse
+def _rates(seeds: dict[int, dict[str, float]], tasks: tuple[str, ...]) -> NDArray[np.float64]:
+    """The rates (seeds, tasks) of those tasks that all seeds have."""
+    known = [task for task in tasks if all(task in rates for rates in seeds.values())]
+    return np.array([[rates[task] for task in known] for rates in seeds.values()])
+
+
+def beyond_chance(ours: NDArray[np.float64], theirs: NDArray[np.float64], episodes: int) -> str:
+    """The number of tasks in which the Wilson intervals of all seeds' episodes do not meet: better, and worse."""
+    trials = episodes * len(ours)
+    intervals = [[wilson_interval(round(sum(rates) * episodes), trials) for rates in both.T] for both in (ours, theirs)]
+    pairs = list(zip(*intervals, strict=True))
+    return f"{sum(mine[0] > blind[1] for mine, blind in pairs)}, {sum(mine[1] < blind[0] for mine, blind in pairs)}"
 
 
 if __name__ == "__main__":

@@ -65,22 +65,22 @@ def find_points(tasks: TaskList = "MT50", *, suite: str | Suite | None = None, e
         for seed in range(episodes):
             observations = engine.reset(range(len(named)), [seed] * len(named))
             for row, (name, task) in enumerate(named.items()):
-                shapes = _Shapes(engine.model(row).model, engine.poses(row))
+                shapes = Shapes(engine.model(row).model, engine.poses(row))
                 found[name].append(_points(task, observations[row], shapes))
     finally:
         engine.close()
     return {name: _with_points(task, found[name]) for name, task in named.items()}
 
 
-def _points(task: Task, observation: Array, shapes: _Shapes) -> dict[str, tuple[str, Array]]:
+def _points(task: Task, observation: Array, shapes: Shapes) -> dict[str, tuple[str, Array]]:
     """Thing's name to what its point is called and where it is, from the thing's position."""
     hand, *things, goal = task.layout.positions
     found = {}
     for one in task.published.objects[1:]:
         if one.position in [places(part) for part in things]:
             at = observation[[int(number) for number in one.position]]
-            surface = shapes.free_thing(at, observation[hand])
-            if surface is not None:
+            if (thing := shapes.nearest(at, observation[hand])) is not None:
+                surface = thing[1]
                 grip = _grip(surface, -at[2])
                 side = grip if grip is not None else _side(surface, observation[goal] - at, -at[2])
                 if side is not None:
@@ -124,19 +124,19 @@ def _side(surface: Array, way: Array, table: float) -> Array | None:
     return np.asarray(found)
 
 
-class _Shapes:
+class Shapes:
     """Points on the surfaces of a model's bodies, in the frame of ``poses``."""
 
     def __init__(self, model: Any, poses: BodyPoses) -> None:
         self.model, self.poses = model, poses
 
-    def free_thing(self, at: Array, hand: Array) -> Array | None:
-        """(P, 3), from ``at``: the surface of what moves in two directions or more, at that place; None without it."""
+    def nearest(self, at: Array, hand: Array, dofs: int = 2) -> tuple[int, Array] | None:
+        """The body at that place that moves in ``dofs`` directions or more, and its surface (P, 3) from ``at``."""
         model = self.model
         robot = model.body_rootid[np.linalg.norm(self.poses.position - hand, axis=1)[1:].argmin() + 1]
-        best: tuple[float, Array] | None = None
+        best: tuple[float, tuple[int, Array]] | None = None
         for body in sorted({*model.body_weldid[1:].tolist()} - {0}):
-            if model.body_rootid[body] == robot or model.body_dofnum[body] < 2:
+            if model.body_rootid[body] == robot or model.body_dofnum[body] < dofs:
                 continue
             geoms = [geom for geom in range(model.ngeom) if model.body_weldid[model.geom_bodyid[geom]] == body]
             solid = [geom for geom in geoms if model.geom_contype[geom] or model.geom_conaffinity[geom]]
@@ -144,7 +144,7 @@ class _Shapes:
                 surface = np.concatenate(parts)
                 away = float(np.linalg.norm(np.clip(0.0, surface.min(0), surface.max(0))))
                 if away <= _NEAR and (best is None or away < best[0]):
-                    best = away, surface
+                    best = away, (body, surface)
         return None if best is None else best[1]
 
     def _surface(self, geom: int) -> Array:

@@ -23,7 +23,6 @@ from benchmarks.statistics import mean_rate
 from lw_torchrl._util.checks import differences
 from lw_torchrl._util.files import read_json, write_json, write_text
 from lw_torchrl._util.progress import Progress
-from lw_torchrl.language.canonical import worth
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plan_decoding import decode_plan
 from lw_torchrl.language.plan_files import save_plans
@@ -46,7 +45,6 @@ class ComparedAnswer:
     dropped: int  # clauses for the task that were left out
     reason: str  # why there is no plan; "" if there is one
     success: tuple[bool, ...]  # of each episode; all False without a plan
-    worth: tuple[bool, float, float] = (False, 0.0, 0.0)  # of the plan in the answer's words, without trying it
     plan: ConditionalPlan | None = field(default=None, repr=False)  # what was carried out
 
     @property
@@ -92,11 +90,6 @@ class PlanComparison:
         chosen = [max(found, key=lambda one: _mean(one.success[::2])) for found in listed]
         return _mean([_mean(one.success[1::2]) for one in chosen])
 
-    def trusted(self, model: str, format: str) -> float:
-        """The mean over tasks of the success of the answer that is trusted most, chosen without trying any."""
-        chosen = [max(found, key=lambda one: one.worth) for found in self._found[model, format].values()]
-        return _mean([one.rate for one in chosen])
-
     def best_plans(self, model: str, format: str) -> dict[str, ConditionalPlan]:
         """The plan of each task that succeeded most often, of equals the first."""
         listed = self._found[model, format].values()
@@ -111,10 +104,9 @@ class PlanComparison:
             success = str(mean_rate([[_mean(one)] for one in rates.values()]))
             found = [one for one in self.answers if (one.model, one.format) == (model, format)]
             counts = map(str, (len(rates), len(found), sum(bool(one.steps) for one in found)))
-            chosen = f"{self.trusted(model, format):.3f}", f"{self.best_of(model, format):.3f}"
-            rows.append([model, format, *counts, success, *chosen])
+            rows.append([model, format, *counts, success, f"{self.best_of(model, format):.3f}"])
         head = ["model", "format", "tasks", "answers", "with a plan that runs", "success"]
-        head += ["most trusted answer of a task", "best answer of a task"]
+        head.append("best answer of a task")
         return markdown_table(head, rows)
 
     def task_table(self) -> str:
@@ -130,11 +122,8 @@ class PlanComparison:
 
     def to_json(self) -> dict[str, Any]:
         """Settings and answers, with the success of each episode as 0 and 1."""
-        names = [one.name for one in fields(ComparedAnswer) if one.name not in ("success", "worth", "plan")]
-        rows = [
-            {name: getattr(one, name) for name in names} | {"trust": one.worth[1], "success": _bits(one.success)}
-            for one in self.answers
-        ]
+        names = [one.name for one in fields(ComparedAnswer) if one.name not in ("success", "plan")]
+        rows = [{name: getattr(one, name) for name in names} | {"success": _bits(one.success)} for one in self.answers]
         return {"format_version": 1, "settings": self.settings, "answers": rows}
 
 
@@ -189,9 +178,8 @@ def compare_plans(
         steps = 0 if one.scripted is None else len(one.scripted.steps)
         success = (False,) * episodes if one.scripted is None else successes[_key(one.scripted)]
         dropped = len(one.steps) - steps
-        told = (False, 0.0, 0.0) if one.plan is None else worth(one.plan)
         said = (model, format, task, attempt, steps, dropped, reason, success)
-        answers.append(ComparedAnswer(*said, told, one.scripted))
+        answers.append(ComparedAnswer(*said, one.scripted))
     return PlanComparison(answers, settings)
 
 
@@ -239,8 +227,7 @@ def write_report(comparison: PlanComparison, folder: Path) -> list[Path]:
 {comparison.table()}
 
 Success is the mean over tasks, each over its answers; an answer without a plan that runs fails. Brackets
-are 95 % intervals over tasks. The most trusted answer of a task is chosen by its words and conditions, without trying
-any; the best by the even episodes, and counted in the odd ones.
+are 95 % intervals over tasks. The best answer of a task is chosen by the even episodes, and counted in the odd ones.
 
 {comparison.task_table()}
 

@@ -2,10 +2,10 @@
 
 Every function takes success rates in [0, 1] as an array (seeds, tasks), and the confidence of its interval, in (0, 1).
 Two methods have the same tasks in the same order; their seeds are not paired, and may differ in number. Intervals are
-Student's t over the seeds; the tasks stay the same. The standard error is the jackknife's over seeds, for a mean the
-usual one. Two methods' errors add as in Welch's test. A few seeds give wide intervals: with three, t is 4.3 standard
-errors. In simulation (20 tasks, 20 episodes) the 95 % interval holds the true mean in 0.95 of the cases for 3, 5 and 20
-seeds.
+Student's t over the seeds; the tasks stay the same (only :func:`mean_over_tasks` also draws tasks). The standard error
+is the jackknife's over seeds, for a mean the usual one. Two methods' errors add as in Welch's test. A few seeds give
+wide intervals: with three, t is 4.3 standard errors. In simulation (20 tasks, 20 episodes) the 95 % interval holds the
+true mean in 0.95 of the cases for 3, 5 and 20 seeds.
 
 Source: Agarwal et al. 2021, 'Deep Reinforcement Learning at the Edge of the Statistical Precipice', for the statistics;
 Tukey 1958 for the jackknife with Student's t.
@@ -99,6 +99,26 @@ def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> 
         0.225 [-0.121, 0.571]
     """
     return _seed_interval(lambda a, b: a.mean() - b.mean(), _pair(x, y), confidence, least=-1.0)
+
+
+def mean_over_tasks(values: ArrayLike, *, confidence: float = 0.95, draws: int = 10_000) -> Estimate:
+    """Return the mean of ``values`` (seeds, tasks) with an interval that holds for other seeds and other tasks.
+
+    ``values`` are rates, or differences of two rates of the same seed and task: pairs of evaluations of one policy. The
+    hierarchical bootstrap draws seeds and tasks with replacement, one less than there are of each, so that few of them
+    do not make the interval too narrow (Rao & Wu 1988). A single seed counts as the only one.
+
+    Example:
+        >>> estimate = mean_over_tasks([[0.2, 0.0, 0.4, 0.1], [0.3, 0.0, 0.5, 0.0]])
+        >>> round(estimate.value, 4), estimate.low < 0.06, estimate.high > 0.35
+        (0.1875, True, True)
+    """
+    values = np.asarray(values, dtype=np.float64)
+    random = np.random.default_rng(0)
+    weights = [random.multinomial(max(n - 1, 1), [1 / n] * n, size=draws) / max(n - 1, 1) for n in values.shape]
+    means = np.einsum("ds,st,dt->d", weights[0], values, weights[1], optimize=True)
+    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2]).tolist()
+    return Estimate(float(values.mean()), low, high)
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:

@@ -1,4 +1,4 @@
-"""Your own suite: robosuite's Lift, Stack and Door with any of its arms, and Meta-World's policies in it.
+"""Your own suite: robosuite's Lift, Stack and Door with any arm and a Panda's gripper, and Meta-World's policies in it.
 python examples/suite_robosuite.py check --arms Panda Sawyer                 # measure what the suite says of itself
 python examples/suite_robosuite.py expert --arms Panda --task stack --seed 7 # scripted skills
 python examples/suite_robosuite.py POLICY --arms Panda Sawyer --task lift --episodes 50 --seed 3000

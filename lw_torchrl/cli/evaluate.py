@@ -29,7 +29,7 @@ class Rollout:
 
     plans: Annotated[options.PlanSources, options.OPTIONAL, arg(help=_PLANS)] = ()
     suite: options.SuiteName = None
-    speed: Positive = 1.0  # scale factor on the hand's displacement, for a policy trained on another robot
+    speed: Maybe[Positive] = None  # scale factor on metres per step, for another robot (default: full speed stays full)
     skill_file: options.SkillFile = None
     task_file: options.TaskFile = None
     text_encoder: options.Encoder = None

@@ -36,7 +36,7 @@ COMMANDS = {
     "query": ("Language", "language:Ask", "Check whether a query holds in a state of a task"),
     "plan prompt": ("Language", "plan:Prompt", "Print the prompt that asks a language model for a plan"),
     "plan generate": ("Language", "plan:Generate", "Ask a language model for plans"),
-    "plan read": ("Language", "plan:Read", "Show how a free-form plan is parsed, with a confidence score"),
+    "plan read": ("Language", "plan:Read", "Show how a free-form plan is parsed"),
     "plan repair": ("Language", "plan:Repair", "Ask a language model to repair the plans that fail"),
     "demo": ("Other", "demo:Demo", "Train, evaluate and record a policy on MT10 in a few minutes"),
     "check": ("Other", "language:Check", "Validate a file of plans, skills or tasks, or a suite"),

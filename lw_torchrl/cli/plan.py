@@ -184,13 +184,13 @@ class Repair(_Model):
 
 @dataclass(kw_only=True)
 class Read:
-    """Show, step by step, how plans and programs are parsed, with a confidence score; --out saves the parsed plans.
+    """Show, step by step, how plans and programs are parsed; --out saves the parsed plans.
 
     The steps are nested below the conditions that they share. A program may be Python, JSON, YAML or prose.
 
-    The confidence is the fraction of typical states of the motion in which the plan, as written, chooses a correct
-    step. A plan with a confidence below 0.75 keeps its motion and objects, but gets standard conditions. A plan without
-    any motion becomes the fallback plan: grasp the first object and move it to the goal.
+    A plan that, as written, chooses a correct step in less than three quarters of typical states keeps its motion and
+    objects, but gets standard conditions. A plan without any motion becomes the fallback plan: grasp the first object
+    and move it to the goal.
 
     Example: lw-torchrl plan read my-plans/coffee-pull.plan
 
@@ -202,34 +202,32 @@ class Read:
     sources: Positional[Annotated[tuple[str, ...], options.REQUIRED, arg(metavar="SOURCES", help=_SOURCES)]]
     task: Maybe[str] = None  # show only the plan for this task (default for an answer: the task in the file name)
     format: Maybe[str] = None  # plan format of an answer (default: the folder's name, or found by the content)
-    out: Maybe[Path] = None  # folder for the most confident plan of each task, as a .plan file (not completed)
+    out: Maybe[Path] = None  # folder for the first plan of each task, as a .plan file (not completed)
     scripted: Flag = False  # read an answer's skills as the nearest scripted skills, which `evaluate scripted` requires
     task_file: options.TaskFile = None
     json: options.Json = False
 
     def run(self) -> Output:
-        from lw_torchrl.language.canonical import explain_canonical, most_confident
+        from lw_torchrl.language.canonical import explain_canonical
 
         plans = list[lw.ConditionalPlan]()
         output, rows, summaries = Output(self.json), list[Row](), list[Row]()
         for source in self.sources:
             for plan, decoded in self._plans(source):
                 report = explain_canonical(plan)
-                where = {"task": plan.task, "source": f"{report.source}, confidence {report.plan.confidence:.2f}"}
+                where = {"task": plan.task, "source": report.source}
                 tree = _tree(report.notes(), report, None if self.scripted else decoded)
                 rows += [{**where, **row} for row in tree if "written" in row]
                 notes = [] if decoded is None else [str(note) for note in decoded.notes]
-                known = {"task": plan.task, "source": report.source, "confidence": report.plan.confidence}
-                summaries.append({**known, "notes": notes})
+                summaries.append({**where, "notes": notes})
                 plans.append(plan)
                 if not self.json:
                     output.table("", tree, _COLUMNS, f"{source}: {', '.join(where.values())}")
                     print(*(f"{printable(note)}\n" for note in notes), sep="")
         output.show("read", rows).show("plans", summaries)
         if self.out is not None:
-            tasks = dict.fromkeys(plan.task for plan in plans)
-            best = [most_confident(plan for plan in plans if plan.task == task) for task in tasks]
-            output.show("files", lw.save_plans(Plans(best), self.out), f"{counted(len(best), 'plan')} in {self.out}")
+            first = {plan.task: plan for plan in reversed(plans)}
+            output.show("files", lw.save_plans(Plans(first), self.out), f"{counted(len(first), 'plan')} in {self.out}")
         return output
 
     def _plans(self, source: str) -> list[tuple[lw.ConditionalPlan, DecodedPlan | None]]:
@@ -277,7 +275,6 @@ _COLUMNS: Columns = {
     "verb": lambda row: row.get("verb"),
     "object": lambda row: row.get("moved"),
     "target": lambda row: row.get("target"),
-    "confidence": lambda row: f"{row['confidence']:.1f}" if row.get("written") and row["skill"] else "",
     "note": lambda row: "" if row.get("dropped") is None else f"left out: {row['dropped']}",
 }
 
@@ -296,7 +293,7 @@ def _tree(notes: Sequence[Row], report: CanonicalReport, decoded: DecodedPlan | 
         for row, line in zip(notes[:count], at, strict=True)
     ]
     tree = _branches(own, report.written)
-    nothing: Row = {**dict.fromkeys(notes[0]), "confidence": 0.0, "seen": False, "depth": 0, "path": []}
+    nothing: Row = {**dict.fromkeys(notes[0]), "seen": False, "depth": 0, "path": []}
     absent = [step for step in decoded_steps if step.dropped]
     tree += [{**nothing, "written": step.written_skill, "line": step.line, "dropped": step.dropped} for step in absent]
     if report.source != "plan":

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from lw_torchrl._util.checks import typed
 from lw_torchrl.language.completion import completed, gripper_is, is_complete, negated, step_of
-from lw_torchrl.language.confidence import confidence_of, role_of
+from lw_torchrl.language.coverage import coverage_of, role_of
 from lw_torchrl.language.expressions import replace_leaves
 from lw_torchrl.language.objects import GOAL, GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
@@ -26,8 +26,8 @@ from lw_torchrl.language.tasks import (
     whole_objects,
 )
 
-MIN_CONFIDENCE = 0.75
-"""The minimum confidence at which a plan keeps its own conditions."""
+MIN_COVERAGE = 0.75
+"""The minimum fraction of typical states that a plan must cover to keep its own conditions."""
 Source = Literal["plan", "completed", "fallback"]
 _SOURCES = {"plan": "its own steps", "completed": "completed", "fallback": "replaced by the fallback plan"}
 
@@ -52,21 +52,18 @@ class CanonicalReport:
         """Return a JSON row for each step of ``written``, then one for each step that replaces the plan's own.
 
         The keys are ``written`` (None for an added step); ``skill``, ``verb``, ``moved``, ``target`` and ``condition``
-        (None for a step that was left out); ``confidence``; and ``seen``, whether policies see the step.
+        (None for a step that was left out); and ``seen``, whether policies see the step.
         """
 
         def note(step: PlanStep, seen: bool) -> dict[str, Any]:
             role = role_of(step)
             parsed = {"skill": step.skill, "verb": role.verb, "moved": role.moved, "target": role.target}
-            rest = {"condition": str(step.condition), "confidence": role.confidence, "seen": seen}
-            return {"written": role.written or None, **parsed, **rest}
+            return {"written": role.written or None, **parsed, "condition": str(step.condition), "seen": seen}
 
         is_own, read = self.source == "plan", iter(self.read)
         nothing = dict.fromkeys(("skill", "verb", "moved", "target", "condition"))
         return [
-            note(next(read), is_own)
-            if is_read
-            else {"written": step.skill, **nothing, "confidence": 0.0, "seen": False}
+            note(next(read), is_own) if is_read else {"written": step.skill, **nothing, "seen": False}
             for step, is_read in zip(self.written.steps, self.is_read, strict=True)
         ] + [note(step, True) for step in self.plan.steps if not is_own]
 
@@ -83,8 +80,8 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
 
     Args:
         plan: a plan in free-form English.
-        fallback: append the steps of the fallback plan, with ``fallback=True`` in their roles. Policies try these steps
-            when the plan makes no progress. A plan that has a fallback, or is the fallback plan, is unchanged.
+        fallback: append the steps of the fallback plan, with ``fallback=True`` in their roles: policies try these steps
+            when the plan makes no progress, and carry or slide the object in turn. A plan that has them is unchanged.
 
     Example:
         >>> import lw_torchrl as lw
@@ -101,8 +98,11 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
     if not fallback or any(role_of(step).fallback for step in plan.steps):
         return plan
     other = fallback_plan(plan.definition).steps
-    if [(step.condition, step.skill) for step in plan.steps] == [(step.condition, step.skill) for step in other]:
-        return plan
+    if role_of(slide := other[-1]).verb == "move":
+        carry = step_of(slide.condition, replace(role_of(slide), verb="carry"))
+        verbs = {role_of(step).verb for step in plan.steps}
+        slid = "move" in verbs or verbs.isdisjoint(("carry", "push", "pull"))
+        other = (*other[:-1], carry, slide) if slid else (*other, carry)  # first the motion that the plan did not try
     steps = [replace(step, reason="fallback", role=replace(role_of(step), fallback=True)) for step in other]
     return replace(plan, steps=(*plan.steps, *steps))
 
@@ -121,14 +121,14 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
         >>> import lw_torchrl as lw
         >>> written = [("gripper is open", "place the gripper above the mug"), ("gripper is closed", "ponder")]
         >>> report = explain_canonical(lw.ConditionalPlan.from_pairs("coffee-push", written))
-        >>> report.source, report.plan.confidence, report.left_out
-        ('fallback', 0.0, ('ponder',))
+        >>> report.source, report.left_out
+        ('fallback', ('ponder',))
     """
     task, parsed = plan.definition, parse_steps(plan)
     read = _with_roles(plan, parsed)
-    confidence, motion = confidence_of(task, read), _final_motion(read)
+    motion = _final_motion(read)
     source: Source
-    if confidence >= MIN_CONFIDENCE and is_complete(task, read):
+    if is_complete(task, read) and coverage_of(task, read) >= MIN_COVERAGE:
         source, steps = "plan", read
     elif motion is not None:
         source, steps = "completed", completed(task, read, motion)
@@ -138,10 +138,10 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     explained = []
     for number, step in enumerate(steps):
         written = role_of(step).written
-        reasons = [f"confidence {confidence:.2f}, {_SOURCES[source]}"] if number == 0 else []
+        reasons = [_SOURCES[source]] if number == 0 else []
         reasons += [f"as written: {written}"] if written and written != step.skill else []
         explained.append(replace(step, reason="; ".join(reasons)))
-    canonical = ConditionalPlan(plan.task, tuple(explained), task, confidence)
+    canonical = ConditionalPlan(plan.task, tuple(explained), task)
     return CanonicalReport(plan, canonical, source, read, left_out, tuple(map(_has_role, parsed)))
 
 
@@ -153,14 +153,19 @@ def fallback_plan(task: str | Task) -> ConditionalPlan:
     task = get_task(task)
     held = first_object(task)
     if held is not None:
-        steps = completed(task, (), StepRole("move", held, GOAL, "grasp", confidence=0.0))
-        return ConditionalPlan(task.name, steps, task)
+        return plan_of_motion(task, StepRole("move", held, GOAL, "grasp", confidence=0.0))
     names = whole_objects(task)
     goal = next((name for name in names if is_goal(task, name)), None)
     # Without an object and without a named goal, the first named place is the target.
     near, target = gripper_is("near", goal or names[0]), GOAL if goal else names[0]
     approach = step_of(negated(near), StepRole("reach", GRIPPER, target, "reach"))
     return ConditionalPlan(task.name, (approach, step_of(near, StepRole("hold", GRIPPER, target, "reach"))), task)
+
+
+def plan_of_motion(task: str | Task, motion: StepRole) -> ConditionalPlan:
+    """Build the plan with standard conditions that carries out ``motion`` on a task's first object."""
+    task = get_task(task)
+    return ConditionalPlan(task.name, completed(task, (), motion), task)
 
 
 def _has_role(each: ParsedStep | None) -> bool:
@@ -255,18 +260,6 @@ def _final_motion(steps: Sequence[PlanStep]) -> StepRole | None:
     moving = [step for step in steps if role_of(step).verb in ("carry", "move") and not is_free(step)]
     to_goal = [step for step in moving if role_of(step).target == GOAL]
     return motion_of([role_of(step) for step in to_goal or steps])
-
-
-def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
-    """Return a sort key for plans of a task: (has a motion, confidence of the plan, mean confidence of the steps)."""
-    report = explain_canonical(plan)
-    steps = sum(role_of(step).confidence for step in report.read) / (len(report.read) + len(report.left_out))
-    return report.source != "fallback", report.plan.confidence or 0.0, steps
-
-
-def most_confident(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
-    """Return the plan with the largest :func:`worth`; the first such plan if several tie."""
-    return max(plans, key=worth)
 
 
 def canonical_like(plans: Plans, reference: Plans | None) -> Plans:

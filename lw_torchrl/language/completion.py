@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from lw_torchrl.language.confidence import moves_before_grasp, role_of, touched_point
+from lw_torchrl.language.coverage import moves_before_grasp, role_of, touched_point
 from lw_torchrl.language.expressions import Expression, all_of, any_of, leaves, negate
 from lw_torchrl.language.objects import GOAL, GRIPPER
 from lw_torchrl.language.plans import PlanStep

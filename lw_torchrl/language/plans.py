@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._util.checks import Probability, shown, typed, typed_fields
+from lw_torchrl._util.checks import shown, typed, typed_fields
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import comparisons
@@ -82,9 +82,7 @@ class ConditionalPlan:
     """A plan for one task: 1 to 1,000 steps, as in the paper's section 'Conditional Plan Generation'.
 
     Conditions and skills are stored in canonical spelling (``str(query)``, "the" before nouns), so that parsing the
-    plan's text returns an equal plan. Two plans are equal if their conditions, skills and goals are equal. In a plan
-    from :func:`~lw_torchrl.canonical_plan`, ``confidence`` is the fraction of typical states in which the plan, as
-    written, does what its motion needs.
+    plan's text returns an equal plan. Two plans are equal if their conditions, skills and goals are equal.
 
     Raises:
         PlanError: a condition, a skill or a role is not valid for the task; the message names the step.
@@ -99,7 +97,6 @@ class ConditionalPlan:
     steps: tuple[PlanStep, ...]
     # The task whose objects the conditions name; None for the shipped task with the name ``task``.
     definition: Task = field(default=None, compare=False, repr=False)  # type: ignore[assignment]
-    confidence: Probability | None = None
 
     def __post_init__(self) -> None:
         task, plan = self.definition or TASKS[check_task(self.task)], f"plan {self.task!r}"
@@ -189,20 +186,21 @@ class ConditionalPlan:
         return function_head(self.definition) + "".join(f"{line}\n" for line in lines)
 
     def to_json(self) -> dict[str, Any]:
-        """Convert the plan to JSON: its text, its task if not shipped, and its roles and confidence, if any."""
+        """Convert the plan to JSON: its text, its task if not shipped, and its roles, if any."""
         row: dict[str, Any] = {"plan": str(self)}
         if self.definition != TASKS.get(self.task):
             row["task"] = self.definition.to_json()
         if any(step.role for step in self.steps):
             row["roles"] = [step.role and step.role.to_json() for step in self.steps]
-        return row if self.confidence is None else {**row, "confidence": self.confidence}
+        return row
 
     @classmethod
     def from_json(cls, name: str, row: Any) -> ConditionalPlan:
         """Rebuild the plan for task ``name`` from :meth:`to_json`; raise a PlanError if ``row`` is not such JSON."""
         from lw_torchrl.language.plan_files import parse_plan  # here, because plan_files imports this module
 
-        where, keys = f"plan of {shown(name)}", ("plan", "task", "roles", "confidence")
+        where = f"plan of {shown(name)}"
+        keys = ("plan", "task", "roles", "confidence")  # earlier versions wrote a confidence, which predicted nothing
         if not isinstance(row, dict) or not isinstance(row.get("plan"), str) or set(row) - {*keys}:
             raise PlanError(f'{where} must be an object {{"plan": text, "task": object}}, got {shown(row)}')
         try:
@@ -215,7 +213,7 @@ class ConditionalPlan:
                 replace(step, role=None if role is None else StepRole.from_json(role))
                 for step, role in zip(plan.steps, roles, strict=True)
             ]
-            return replace(plan, steps=tuple(steps), confidence=row.get("confidence"))
+            return replace(plan, steps=tuple(steps))
         except PlanError:
             raise
         except (ValueError, TypeError) as error:

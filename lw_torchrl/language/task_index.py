@@ -88,7 +88,8 @@ class PlanTables:
     Attributes:
         index: the index from task ids to the T rows.
         mask: (T, S) bool, true for plan steps, false for padding.
-        turns: (T, 2, S) bool, masks of the plan's own steps and of its fallback steps (its own steps without fallback).
+        turns: (T, 6, S) bool, masks of the steps of each turn, in a cycle: the plan's own; those of the fallback that
+            let go; with its first motion; the plan's own; that let go; with its second. Without a fallback, all steps.
         skill_index: (T, S) int64, the index of each plan step's skill in ``plans.skills``; 0 for padding.
         number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
     """
@@ -97,15 +98,19 @@ class PlanTables:
         self.index = TaskIndex(plans.task_ids)
         self._problem = f"tasks without a plan in {plans!r}"
         self.mask = torch.zeros(len(plans), plans.num_steps, dtype=torch.bool)
-        self.turns = torch.zeros(len(plans), 2, plans.num_steps, dtype=torch.bool)
+        self.turns = torch.zeros(len(plans), 6, plans.num_steps, dtype=torch.bool)
         self.skill_index = torch.zeros(len(plans), plans.num_steps, dtype=torch.int64)
         skill = {text: number for number, text in enumerate(plans.skills)}
         for row, task in enumerate(self.index.tasks):
             steps = plans[task].steps
             self.mask[row, : len(steps)] = True
-            fallback = torch.tensor([step.role is not None and step.role.fallback for step in steps])
-            self.turns[row, 0, : len(steps)] = ~fallback
-            self.turns[row, 1, : len(steps)] = fallback if fallback.any() else ~fallback
+            back = {n: step.role.verb for n, step in enumerate(steps) if step.role is not None and step.role.fallback}
+            own = [n for n in range(len(steps)) if n not in back]
+            let_go = [n for n, verb in back.items() if verb in ("approach", "reach")]
+            motions = [n for n, verb in back.items() if verb in ("carry", "move")]  # one in files of earlier versions
+            first, second = ([n for n in back if n not in other] for other in (motions[1:], motions[:-1]))
+            for turn, active in enumerate((own, let_go, first, own, let_go, second)):
+                self.turns[row, turn, active or own] = True
             self.skill_index[row, : len(steps)] = torch.tensor([skill[step.skill] for step in steps])
         numbers = plans.numbers
         self.number = torch.tensor([numbers[task] for task in self.index.tasks])

@@ -85,7 +85,7 @@ class PlanAttention(Part):
         super().__init__(("qaf", "task_id", "turn")[: 2 + has_fallback], ("skill_weights",), in_keys, out_keys)
         self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout
         self.tables, self.has_fallback = tables, has_fallback
-        # (T, 2, S) bool: the plan's own steps, and the fallback steps; without a fallback, both masks are all steps.
+        # (T, 6, S) bool: the steps of each turn; without a fallback, all masks are all steps.
         self.register_buffer("mask", tables.turns, persistent=False)
 
     @property
@@ -107,8 +107,9 @@ class PlanAttention(Part):
 
     def weights(self, qaf: Tensor, rows: Tensor, turn: Tensor | None = None) -> Tensor:
         """Return the attention (..., S) float32 for truth (..., S), table rows (...) int64 and turns (...) int64."""
-        # In the flattened mask (2T, S), row 2t holds task t's own steps and row 2t + 1 its fallback steps.
-        mask = pick(self.mask.flatten(0, 1), 2 * rows if turn is None else 2 * rows + turn % 2)
+        # In the flattened mask (6T, S), row 6t + i holds the steps of task t in turn i.
+        number = self.mask.shape[1]
+        mask = pick(self.mask.flatten(0, 1), number * rows if turn is None else number * rows + turn % number)
         check_truth(qaf, mask.shape)
         return attend(2 * TRUE_LOGIT * qaf.to(torch.float32) - TRUE_LOGIT, mask)
 

@@ -224,8 +224,9 @@ class DemonstratedActor(_Wrapper):
 class TransferredActor(_ActionWrapper):
     """A wrapper that runs an actor on another suite's plans, and converts the actions to that suite's layout.
 
-    The displacement per time step, in metres, is multiplied by ``speed``; actions are scaled by the ratio of the
-    layouts' ``reach`` and clipped to [-1, 1]. A ``binary_gripper`` closes at an effort above ``closes_above``.
+    A full displacement stays a full displacement, so the hand moves as fast as the new robot can; with ``speed``, it
+    moves by that multiple of its metres per time step in the training suite. A ``binary_gripper`` closes at an effort
+    above ``closes_above``.
 
     Reads the actor's input keys, in the other layout; writes ``action`` (B, A) float32 in [-1, 1] and the actor's other
     output keys.
@@ -233,7 +234,7 @@ class TransferredActor(_ActionWrapper):
     Args:
         actor: an actor whose features have the same meaning in both layouts: :class:`RoleFeatures` and "opening".
         plans: plans for the other suite's tasks.
-        speed: scale factor of the displacement, for simulators with longer time steps.
+        speed: scale factor of the metres per time step; None keeps a full displacement full.
         trained: the layout with which the actor was trained; None for the actor's layout.
 
     Raises:
@@ -256,7 +257,12 @@ class TransferredActor(_ActionWrapper):
 
     @typed
     def __init__(
-        self, actor: TensorDictModuleBase, plans: AnyPlans, *, speed: Positive = 1.0, trained: Layout | None = None
+        self,
+        actor: TensorDictModuleBase,
+        plans: AnyPlans,
+        *,
+        speed: Positive | None = None,
+        trained: Layout | None = None,
     ) -> None:
         plans, trained = as_plans(plans), trained or layout_of(actor)
         super().__init__(actor if _fingerprint(actor) == plans.fingerprint else with_plans(actor, plans))
@@ -269,7 +275,8 @@ class TransferredActor(_ActionWrapper):
         """Convert actions (..., A) from the training layout to this layout."""
         old, new = self.trained, self.layout
         result = action.new_zeros((*action.shape[:-1], new.action_size))
-        moved = action[..., old.displaced("TransferredActor")] * (self.speed * old.reach / new.reach)
+        scale = 1.0 if self.speed is None else self.speed * old.reach / new.reach
+        moved = action[..., old.displaced("TransferredActor")] * scale
         result[..., new.displaced("TransferredActor")] = moved.clamp(-1.0, 1.0)
         effort = action[..., old.effort].sum(-1, keepdim=True) * old.closes
         result[..., new.effort] = effort * new.closes

@@ -63,7 +63,6 @@ class RecordedEpisode:
     steps: tuple[tuple[str, str], ...] = ()  # S (condition, skill) texts; empty without a plan
     guards: tuple[Any, ...] = ()  # S conditions: queries, or the objects of another plan
     reasons: tuple[str, ...] = ()  # S texts: a plan step's comment, or the skill as originally written
-    confidence: float | None = None  # confidence score of a canonical plan
     target_poses: tuple[TargetPose | None, ...] = ()  # S; None for a skill that is not scripted
     pixels: NDArray[np.uint8] | None = None  # T×H×W×C, the input images of the policy or the evaluator
     step_time: float = STEP_TIME  # seconds between two actions
@@ -203,7 +202,6 @@ class RecordedEpisode:
             steps=steps,
             guards=() if plan is None else tuple(step.condition for step in plan.steps),
             reasons=() if plan is None else tuple(map(_reason, plan.steps)),
-            confidence=getattr(plan, "confidence", None),
             pixels=None if pixels is None else np.stack([check_image("pixels", picture) for picture in pixels]),
             step_time=step_time,
         )

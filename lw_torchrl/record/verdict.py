@@ -189,11 +189,10 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
     active = np.full(len(episode), NO_STEP) if episode.active is None else episode.active
     answers = [answers for answers in (episode.qaf, episode.believed) if answers is not None]
     rows = changes(np.concatenate([active[:, None], *answers], axis=1))
-    confidence = [] if episode.confidence is None else [f"*confidence {episode.confidence:.2f}*"]
     lines = _plan_lines(episode)
     texts = []
     for row in rows.tolist():
-        parts = list(confidence)
+        parts = list[str]()
         if episode.active is not None and episode.active[row] == NO_STEP:
             none = episode.answers is None or not episode.answers[row].any()
             parts.append(f"**{'No condition holds' if none else 'No step stands out'}: all steps mixed**")

@@ -64,7 +64,7 @@ class PlanAugmentation(Augmentation):
         plans = as_plans(plans)
         self.fingerprint = plans.fingerprint  # identifies this transform in training checkpoints
         self._tables = PlanTables(plans)
-        self.register_buffer("steps", self._tables.turns, persistent=False)  # (T, 2, S) bool
+        self.register_buffer("steps", self._tables.turns, persistent=False)  # (T, 6, S) bool
         return plans
 
     def answers(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor, Tensor]:
@@ -74,7 +74,8 @@ class PlanAugmentation(Augmentation):
         if qaf.shape != (shape := (*rows.shape, self._tables.mask.shape[-1])):
             raise ValueError(f"qaf must have shape {shape}, one column for each step of plans, got {tuple(qaf.shape)}")
         turn = tensordict.get("turn", None)
-        return qaf, rows, self.table("steps", rows.device)[rows, torch.zeros_like(rows) if turn is None else turn % 2]
+        steps = self.table("steps", rows.device)
+        return qaf, rows, steps[rows, torch.zeros_like(rows) if turn is None else turn % steps.shape[1]]
 
     def active(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor]:
         """Return a mask of the active plan steps (B, S) bool, and, for each batch row, the index of its row in the

@@ -24,11 +24,12 @@ class _Rows(NamedTuple):
 
 
 class FallbackTurns(Transform):
-    """A transform that counts the turns of an episode: the plan runs in even turns, the fallback plan in odd turns.
+    """A transform that counts the turns of an episode: the plan, letting go, one motion; the plan, letting go, another.
 
     A turn ends when neither the hand nor an object has moved farther than ``still`` for ``patience`` time steps, and
-    after at most ``longest`` time steps. :class:`~lw_torchrl.modules.PlanAttention` reads the turn if the plans have
-    fallback steps, see :func:`~lw_torchrl.canonical_plans`.
+    after at most ``longest`` time steps; a turn that lets go lasts ``release`` time steps.
+    :class:`~lw_torchrl.modules.PlanAttention` reads the turn if the plans have fallback steps, see
+    :func:`~lw_torchrl.canonical_plans`.
 
     In an environment, the transform reads ``observation`` (B, 39) float32, metres, and writes ``turn`` (B,) int64, from
     0. Rows of a replay buffer keep the recorded ``turn``; rows without ``turn`` get 0.
@@ -37,6 +38,7 @@ class FallbackTurns(Transform):
         layout: the layout of the observations.
         patience: number of time steps without motion that end a turn.
         longest: maximum length of a turn, in time steps.
+        release: length of a turn that lets go of an object, in time steps.
         still: the largest distance, in metres, that does not count as motion.
         in_keys, out_keys: replacements for the keys ``observation`` and ``turn``.
 
@@ -46,7 +48,7 @@ class FallbackTurns(Transform):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> import lw_torchrl as lw
-        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.FallbackTurns(patience=5))
+        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.FallbackTurns(patience=5, release=5))
         >>> env.rollout(12, lambda td: td.set("action", td["observation"].new_zeros(1, 4)))["turn"].max()
         tensor(2)
 
@@ -60,6 +62,7 @@ class FallbackTurns(Transform):
         *,
         patience: Count = 60,
         longest: Count = 250,
+        release: Count = 20,
         still: Scale = 0.02,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
@@ -67,7 +70,8 @@ class FallbackTurns(Transform):
         keys = as_keys("in_keys", in_keys, ("observation",))
         super().__init__(in_keys=keys, out_keys=as_keys("out_keys", out_keys, ("turn",)))
         check_apart(self.in_keys, self.out_keys)
-        self.layout, self.patience, self.longest, self.still = layout, patience, longest, still
+        self.layout, self.patience, self.longest = layout, patience, longest
+        self.release, self.still = release, still
         self._rows: _Rows | None = None
 
     def _positions(self, tensordict: TensorDictBase) -> Tensor:
@@ -93,7 +97,7 @@ class FallbackTurns(Transform):
         now, (turn, waited, lasted, stood) = self._positions(next_tensordict), self._rows
         moved = ((now - stood).norm(dim=-1) > self.still).any(-1)
         waited, lasted = torch.where(moved, 0, waited + 1), lasted + 1
-        over = (waited >= self.patience) | (lasted >= self.longest)
+        over = torch.where(turn % 3 == 1, lasted >= self.release, (waited >= self.patience) | (lasted >= self.longest))
         stood = torch.where((moved | over)[..., None, None], now, stood)
         after = _Rows(turn + over, torch.where(over, 0, waited), torch.where(over, 0, lasted), stood)
         return self._keep(next_tensordict, after, tensordict.get("_step", None))

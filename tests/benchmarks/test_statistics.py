@@ -17,6 +17,7 @@ from benchmarks.statistics import (
     count_solved,
     interquartile_mean,
     mean_difference,
+    mean_over_tasks,
     mean_rate,
     probability_of_improvement,
 )
@@ -104,6 +105,23 @@ def test_intervals_contain_the_truth_in_95_of_100_cases(seeds):
     assert coverage(mean_rate, P.mean(), lambda rng: [x(rng)]) == pytest.approx(0.95, abs=0.03)
     difference = coverage(mean_difference, (P - Q).mean(), lambda rng: [x(rng), y(rng)])
     assert difference == pytest.approx(0.95, abs=0.03)
+
+
+@pytest.mark.parametrize("seeds", [1, 3, 5])
+def test_interval_over_tasks_contains_the_mean_over_all_tasks(seeds):
+    """Tasks, seeds and the episodes of each are drawn; with one seed, seeds do not differ."""
+    spread = 0.05 if seeds > 1 else 0.0
+
+    def draw(rng):
+        tasks, offsets = rng.normal(0.1, 0.2, 20), spread * rng.normal(size=(seeds, 1))
+        return [tasks + offsets + rng.normal(0.0, 0.1, (seeds, 20))]
+
+    assert coverage(lambda x: mean_over_tasks(x, draws=1000), 0.1, draw) == pytest.approx(0.94, abs=0.03)
+
+
+def test_interval_over_tasks_of_equal_values_is_that_value():
+    estimate = mean_over_tasks(np.full((3, 4), 0.25))
+    assert (estimate.value, estimate.low, estimate.high) == pytest.approx((0.25, 0.25, 0.25))
 
 
 def test_interval_of_the_probability_of_improvement_contains_the_truth():

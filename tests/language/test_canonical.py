@@ -11,7 +11,6 @@ import lw_torchrl as lw
 from benchmarks.language import as_branches
 from lw_torchrl.language import canonical, roles, step_parser
 from lw_torchrl.language.canonical import (
-    MIN_CONFIDENCE,
     canonical_plan,
     canonical_plans,
     explain_canonical,
@@ -41,7 +40,7 @@ def meanings(plan):
 
 
 def without_roles(plan):
-    return replace(plan, steps=tuple(replace(step, role=None) for step in plan.steps), confidence=None)
+    return replace(plan, steps=tuple(replace(step, role=None) for step in plan.steps))
 
 
 @pytest.mark.parametrize(
@@ -133,7 +132,6 @@ def test_a_plan_that_misses_states_is_completed():
     ]
     report = explain_canonical(plan_of("coffee-pull", *steps))
     assert report.source == "completed"
-    assert report.plan.confidence < MIN_CONFIDENCE
     roles = roles_of(report.plan)
     assert [role.verb for role in roles] == ["approach", "descend", "close", "carry"]
     assert [role.target for role in roles] == ["mug rim"] * 3 + [GOAL]
@@ -145,10 +143,10 @@ def test_a_plan_that_misses_states_is_completed():
 def test_a_plan_without_a_motion_becomes_the_fallback_plan():
     steps = [("the gripper is open", "place the gripper above the mug"), ("the gripper is closed", "ponder")]
     report = explain_canonical(plan_of("coffee-pull", *steps))
-    assert (report.source, report.plan.confidence, report.left_out) == ("fallback", 0.0, ("ponder",))
+    assert (report.source, report.left_out) == ("fallback", ("ponder",))
     fallback = fallback_plan("coffee-pull")
     assert without_roles(report.plan) == without_roles(fallback)
-    assert canonical_plan(without_roles(fallback)).confidence == 1.0
+    assert explain_canonical(without_roles(fallback)).source == "plan"
 
 
 def test_an_unreadable_step_is_left_out_by_name():
@@ -156,7 +154,7 @@ def test_an_unreadable_step_is_left_out_by_name():
     report = explain_canonical(plan_of("push", *steps))
     assert report.left_out == ("be careful",)
     assert report.notes()[-1] == dict.fromkeys(("skill", "verb", "moved", "target", "condition")) | {
-        "written": "be careful", "confidence": 0.0, "seen": False
+        "written": "be careful", "seen": False
     }  # fmt: skip
 
 
@@ -195,7 +193,6 @@ def test_any_words_become_a_plan_that_covers_the_task(task, written):
     steps = [(own[number % len(own)].condition, f"push {text}") for number, text in written]
     plan = canonical_plan(plan_of(task, *steps))
     assert plan.steps
-    assert 0.0 <= plan.confidence <= 1.0
     assert len(role_vectors(roles_of(plan))) == len(plan.steps)
     assert plan.definition == OWN[task].definition
 
@@ -208,7 +205,7 @@ def test_the_order_of_clauses_does_not_matter(random, task):
         for step in plan.steps
     ]
     report, other = explain_canonical(plan), explain_canonical(plan_of(task, *shuffled))
-    assert (report.source, report.plan.confidence) == (other.source, other.plan.confidence)
+    assert report.source == other.source
     assert [step.skill for step in report.plan.steps] == [step.skill for step in other.plan.steps]
 
 
@@ -216,7 +213,7 @@ def test_the_order_of_clauses_does_not_matter(random, task):
 def test_a_tree_of_branches_has_the_canonical_form_of_the_flat_plan(task):
     plan = OWN[task]
     flat, tree = explain_canonical(plan), explain_canonical(as_branches(plan))
-    assert (tree.source, tree.plan.confidence) == (flat.source, flat.plan.confidence)
+    assert tree.source == flat.source
     assert [step.role for step in tree.plan.steps] == [step.role for step in flat.plan.steps]
     assert lw.ConditionalPlan.from_json(task, as_branches(plan).to_json()) == as_branches(plan)
 
@@ -250,11 +247,14 @@ def test_canonical_plans_are_plans_with_roles():
 
 
 @pytest.mark.parametrize("plans", [CANONICAL, OWN], ids=["roles", "none"])
-def test_roles_and_confidence_are_kept_in_json(plans):
+def test_roles_are_kept_in_json(plans):
     again = Plans.from_json(plans.to_json())
     assert again == plans
-    assert [plan.confidence for plan in again.values()] == [plan.confidence for plan in plans.values()]
     assert again.numbers == plans.numbers
+
+
+def test_the_confidence_of_earlier_files_is_ignored():
+    assert ConditionalPlan.from_json("dial-turn", {**DIAL.to_json(), "confidence": 0.5}) == DIAL
 
 
 def test_the_json_of_a_plan_without_roles_is_its_text():
@@ -275,15 +275,15 @@ def test_canonical_plans_are_not_parsed_again():
 def test_the_fallback_plan_follows_the_steps_of_the_plan():
     own = canonical_plan(OWN["dial-turn"])
     assert DIAL.steps[: len(own.steps)] == own.steps
-    assert [step.role.fallback for step in DIAL.steps] == [False] * len(own.steps) + [True] * 4
-    assert [step.role.verb for step in DIAL.steps[-4:]] == ["approach", "descend", "close", "move"]
+    assert [step.role.fallback for step in DIAL.steps] == [False] * len(own.steps) + [True] * 5
+    assert [step.role.verb for step in DIAL.steps[-5:]] == ["approach", "descend", "close", "move", "carry"]
 
 
-def test_the_fallback_plan_has_no_fallback():
+def test_the_fallback_plan_also_has_a_fallback():
     wrong = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "ponder")])
     plan = canonical_plan(wrong, fallback=True)
-    assert not any(step.role.fallback for step in plan.steps)
-    assert plan.confidence == 0.0
+    assert [step.role.fallback for step in plan.steps] == [False] * 4 + [True] * 5
+    assert [step.role.verb for step in plan.steps[-3:]] == ["close", "carry", "move"], "first what it did not try"
 
 
 def test_a_role_names_the_objects_of_a_step():
@@ -306,8 +306,6 @@ def test_vectors_of_roles_have_a_one_for_verb_and_manner_each():
     ("change", "message"),
     [
         ({"roles": []}, "one entry per step"),
-        ({"confidence": 2}, "confidence"),
-        ({"confidence": "high"}, "confidence"),
         ({"more": 1}, "must be an object"),
         ({"roles": {"verb": "juggle"}}, "verb"),
         ({"roles": {"direction": "north"}}, "direction"),

@@ -126,8 +126,15 @@ def test_a_wider_qaf_is_read_if_qaf_plan_shows_the_same_plan():
     assert lw.PlanConditionedQValue(two)(wide.set("action", torch.zeros(5, 4)))["state_action_value"].shape == (5, 1)
 
 
-@pytest.mark.parametrize("turn", [None, 0, 1, 2, 3])
-def test_fallback_steps_have_their_own_turns(turn):
+APPROACH, HELD = {"approach"}, {"approach", "descend", "close"}
+
+
+@pytest.mark.parametrize(
+    ("turn", "verbs"),
+    [(None, ()), (0, ()), (1, APPROACH), (2, {*HELD, "move"}), (3, ()), (4, APPROACH), (11, {*HELD, "carry"})],
+)
+def test_fallback_steps_have_their_own_turns(turn, verbs):
+    """The plan, which carries; letting go, sliding; the plan, letting go, carrying; and so on."""
     plans = lw.canonical_plans(lw.load_plans("MT10"), fallback=True)
     attention = PlanAttention(plans)
     assert attention.in_keys == ["qaf", "task_id", "turn"]
@@ -135,8 +142,8 @@ def test_fallback_steps_have_their_own_turns(turn):
     if turn is not None:
         rows["turn"] = torch.full((8,), turn)
     output = attention(rows)["skill_weights"][:, : len(plans["push"].steps)]
-    fallback = torch.tensor([step.role.fallback for step in plans["push"].steps])
-    active = fallback if (turn or 0) % 2 else ~fallback
+    roles = [step.role for step in plans["push"].steps]
+    active = torch.tensor([role.verb in verbs if role.fallback else not verbs for role in roles])
     torch.testing.assert_close(output[:, active].sum(-1), torch.ones(8))
     assert not output[:, ~active].any()
 

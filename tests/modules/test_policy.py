@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from small_actors import ACTORS, CANONICAL, FALLBACK, PLANS, make_actor, make_descriptor, make_role_actor, make_rows
@@ -97,13 +99,18 @@ def test_policy_without_progress_reaches_its_fallback_steps():
     assert max(turns) >= 1
 
 
-@pytest.mark.parametrize("turn", [0, 1])
+@pytest.mark.parametrize("turn", [0, 5])
 def test_each_turn_acts_as_an_actor_of_only_that_plan(turn):
-    """Even turns use the plan's own steps, odd turns the fallback plan's."""
-    from lw_torchrl.language.canonical import fallback_plan
+    """Turn 0 uses the plan's own steps, turn 5 the fallback's with its second motion."""
+
+    def second(plan):
+        steps = [step for step in plan.steps if step.role.fallback]
+        first = next((step for step in steps if step.role.verb in ("carry", "move")), None)
+        rest = [replace(step, role=replace(step.role, fallback=False)) for step in steps if step is not first]
+        return replace(plan, steps=tuple(rest))
 
     actor = make_role_actor(FALLBACK)
-    alone = lw.Plans([fallback_plan(plan.definition) for plan in PLANS.values()]) if turn else CANONICAL
+    alone = lw.Plans([second(plan) for plan in FALLBACK.values()]) if turn else CANONICAL
     other = actor.with_plans(alone)
     rows = make_rows(40, plans=PLANS, answered=False)
     output = actor(transform_of(actor)(rows.copy()).set("turn", torch.full((40,), turn)))["action"]

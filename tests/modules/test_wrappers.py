@@ -246,15 +246,15 @@ def test_unsuitable_pairs_of_policies_are_refused():
 # ---- TransferredActor
 
 
-def test_displacement_keeps_its_metres():
+def test_full_displacement_stays_full_or_keeps_its_metres():
     fetch = lw.canonical_plans(load_suite("fetch").plans)
     features = Concat(ObservationFeatures("opening"), RoleFeatures(CANONICAL))
     actor = make_actor(CANONICAL, features=features)
     rows = torch.rand(20, 4) - 0.5
-    for speed in (1.0, 2.0):
+    reach = METAWORLD.reach / fetch.layout.reach
+    for speed, ratio in ((None, 1.0), (1.0, reach), (2.0, 2.0 * reach)):
         moved = TransferredActor(actor, fetch, speed=speed)
         output = moved.converted(rows)
-        ratio = speed * METAWORLD.reach / fetch.layout.reach
         expected = (rows[:, METAWORLD.displaced("test")] * ratio).clamp(-1, 1)
         torch.testing.assert_close(output[:, fetch.layout.displaced("test")], expected)
         assert {id(one) for one in moved.parameters()} == {id(one) for one in actor.parameters()}

@@ -17,7 +17,7 @@ HAND, OBJECT = slice(0, 3), slice(4, 7)
 
 def turns_of(ways, rows=None, **options):
     """Return the turn after each step of observations (T, B, 39); the first is a reset's."""
-    transform = FallbackTurns(**options)
+    transform = FallbackTurns(**{"release": options["patience"], **options})
     start = TensorDict(observation=ways[0], batch_size=[ways.shape[1]])
     result = [transform._reset(TensorDict(batch_size=start.batch_size), start)["turn"]]
     for number, now in enumerate(ways[1:]):
@@ -52,7 +52,13 @@ def test_small_motions_do_not_count():
 def test_turn_ends_after_its_maximum_length():
     ways = standing(8)
     ways[::2, 0, 0] = 0.3
-    assert turns_of(ways, patience=3, longest=4).flatten().tolist() == [0, 0, 0, 0, 1, 1, 1, 1, 2]
+    assert turns_of(ways, patience=3, longest=4, release=4).flatten().tolist() == [0, 0, 0, 0, 1, 1, 1, 1, 2]
+
+
+def test_letting_go_takes_its_time_steps_whether_something_moves_or_not():
+    ways = standing(9)
+    ways[5::2, 0, HAND] = 0.3
+    assert turns_of(ways, patience=2, longest=99, release=5).flatten().tolist() == [0, 0, 1, 1, 1, 1, 1, 2, 2, 2]
 
 
 def test_motion_of_the_goal_does_not_count():
@@ -103,12 +109,12 @@ def test_policy_with_fallback_steps_on_rows_and_in_an_environment():
     rows = TensorDict(observation=torch.rand(4, 39), task_id=torch.full((4,), lw.task_id("push")), batch_size=[4])
     assert actor(transform_of(actor)(rows))["action"].shape == (4, 4)
     assert rows["turn"].tolist() == [0] * 4
-    turns = lw.QAFTransform(plans), FallbackTurns(patience=3)
+    turns = lw.QAFTransform(plans), FallbackTurns(patience=3, release=3)
     env = TransformedEnv(lw.LanguageWorldEnv("push", max_steps=12), Compose(*turns))
     still = lambda td: actor(td).set("action", torch.zeros(1, 4))  # noqa: E731
     rollout = env.rollout(12, still)
     fallback = torch.tensor([step.role.fallback for step in plans["push"].steps])
     weights = rollout["skill_weights"][0, :, : len(fallback)] @ fallback.float()
     assert rollout["turn"].max() >= 2
-    torch.testing.assert_close(weights, (rollout["turn"][0] % 2).float())
+    torch.testing.assert_close(weights, (rollout["turn"][0] % 3 > 0).float())
     env.close()

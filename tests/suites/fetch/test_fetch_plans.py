@@ -21,7 +21,7 @@ def test_every_step_has_a_scripted_skill_and_is_understood():
         assert {step.skill for step in plan.steps} <= set(allowed)
         canonical = explain_canonical(plan)
         assert canonical.left_out == ()
-        assert (canonical.source, canonical.plan.confidence) == ("plan", 1.0)
+        assert canonical.source == "plan"
 
 
 def test_plans_and_tasks_can_be_saved(tmp_path):

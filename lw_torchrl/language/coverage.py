@@ -1,4 +1,4 @@
-"""The confidence in a plan: the fraction of typical states in which its active steps do what its motion needs."""
+"""The coverage of a plan: the fraction of typical states in which its active steps do what its motion needs."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _has_sides(roles: Sequence[StepRole]) -> bool:
     return len(sides) > 1 and all(any(role.target == side and role.verb in BY_HAND for role in roles) for side in sides)
 
 
-def confidence_of(task: Task, steps: Sequence[PlanStep]) -> float:
+def coverage_of(task: Task, steps: Sequence[PlanStep]) -> float:
     """Return the fraction of typical states of the plan's motion in which the active steps do what the motion needs."""
     roles = [role_of(step) for step in steps]
     motion = motion_of(roles)
