@@ -280,7 +280,7 @@ def test_saving_replaces_only_the_named_plans(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["drawer-open.plan", "notes.txt", "push.plan"]
 
 
-@pytest.mark.parametrize("wrong", [None, "push", [plan()], plan(), {"reach": plan()}, {}])
+@pytest.mark.parametrize("wrong", [None, "push", plan(), {"reach": plan()}, {}])
 def test_saving_something_else_writes_nothing(tmp_path, wrong):
     with pytest.raises((TypeError, PlanError)):
         save_plans(wrong, tmp_path / "new")
@@ -389,7 +389,7 @@ def test_any_condition_of_a_pair_becomes_the_nearest_query(tmp_path_factory, con
         ({"push": [["gripper is open", "7"]]}, "skill must begin"),
         ({"push": []}, "got 0"),
         ({}, "at least one plan"),
-        ('{"push": ' + "[" * 900 + "]" * 900 + "}", "push, step 1"),
+        ('{"push": ' + "[" * 900 + "]" * 900 + "}", "nested too deeply"),
         ('{"push": [[' + "9" * 5000 + ", 3]]}", "expected JSON"),
         ('{"push": [["gripper is open", "wait"]], "push": [["gripper is closed", "wait"]]}', "'push' more than once"),
         (" " * 2**18 + "{}", f"at most {PLAN_LIMIT} bytes"),
