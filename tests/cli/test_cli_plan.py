@@ -48,7 +48,7 @@ def test_read_shows_how_each_step_was_parsed(capsys, tmp_path):
         ["place the gripper above the mug rim", "approach", "robot's gripper", "mug rim"],
         ["else"],
         ["lower the gripper around the mug rim", "descend", "robot's gripper", "mug rim"],
-        ["else if gripper open"],
+        ["else if gripper wide open"],
         ["close the gripper around the mug rim", "close", "robot's gripper", "mug rim"],
         ["if gripper near mug rim and closed"],
         ["bring the mug to the goal", "carry", "mug", "target location"],
