@@ -50,7 +50,7 @@ def test_read_shows_how_each_step_was_parsed(capsys, tmp_path):
         ["lower the gripper around the mug rim", "descend", "robot's gripper", "mug rim"],
         ["else if gripper wide open"],
         ["close the gripper around the mug rim", "close", "robot's gripper", "mug rim"],
-        ["if gripper near mug rim and closed"],
+        ["else"],
         ["bring the mug to the goal", "carry", "mug", "target location"],
     ]
     steps = document(capsys, "plan read", file)["read"]
