@@ -484,7 +484,11 @@ def _normal(value: Any) -> dict[str, Any]:
     row = {" ".join(words_of(str(key))): each for key, each in value.items()} if isinstance(value, dict) else {}
     unknown = {key for key in row if key not in _KNOWN and key not in PROGRAM_WORDS["always"]}
     short = {key: key.split(" ")[-1] for key in unknown if key.count(" ") == 1 and key.split(" ")[0] not in _TYPES}
-    return {last if (last := short.get(key, key)) in _KNOWN and last not in row else key: row[key] for key in row}
+    result = dict[str, Any]()
+    for key, each in row.items():
+        last = short.get(key, key)
+        result[last if last in _KNOWN and last not in row.keys() | result.keys() else key] = each
+    return result
 
 
 def _get(row: Mapping[str, Any], role: str, default: Any = None) -> Any:
