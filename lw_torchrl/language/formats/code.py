@@ -420,6 +420,10 @@ class _Scope:
             case ast.Name(id=name) | ast.Attribute(value=ast.Name(id="self"), attr=name):
                 value = self.values.get(name)
                 return value if isinstance(value, ast.expr) else None
+            case ast.Attribute(value=ast.Name(id=owner), attr=name) if owner in self.module.fields:  # Phase.PUSH
+                return ast.copy_location(ast.Name(name), node) if name in self.module.constants.values else None
+            case ast.Attribute(value=owner, attr="value") if self.text(owner) is not None:  # of an enumeration
+                return owner
             case ast.Attribute(value=owner, attr=key) | ast.Subscript(value=owner, slice=ast.Constant(value=key)):
                 if (table := self.table(owner)) is not None:
                     pairs = zip(table.keys, table.values, strict=True)
@@ -452,6 +456,9 @@ class _Scope:
                 return self.text(entry)
             case ast.Subscript(value=value, slice=key) if (table := self.table(value)) is not None:
                 return self.text_at(table, self.value(key))
+            case ast.Call() if name := self.module.helper(node):
+                returned = self.called(node, name)
+                return returned if isinstance(returned, str | _Choice) else None
             case ast.Call(func=ast.Attribute(value=value, attr="get"), args=[key, *_]) if table := self.table(value):
                 return self.text_at(table, self.value(key))
             case ast.JoinedStr(values=values):

@@ -20,12 +20,13 @@ _NO_PROSE = re.compile(r"""\s*(?:[#`~{}<]|['"]{3}|(?:def|class|import|from|retur
 _HEADING = re.compile(r"\s*\*\*[^*]*\*\*:?\s*")
 _LABEL = re.compile(r"[\w ]{1,30}\s[–—-]\s(?=(?:otherwise|if|when|while|once|unless|as long)\b)", re.IGNORECASE)
 _LEAD = re.compile(
-    r"(?:then|next|first|second|third|fourth|finally|lastly|last|now|and|also|after that|in that case|please|just|so)\b"
-    r",?\s+",
+    r"(?:then|next|first|second|third|fourth|finally|lastly|last|now|and|also|after that|from there|in that case|please"
+    r"|just|so)\b,?\s+",
     re.I,
 )
 _CATCH_ALL = (
     r"in (?:all|any|every) other (?:cases?|situations?)|anything else|(?:none|neither) of (?:the )?(?:above|these)"
+    r"|(?:if|when) (?:none|neither)(?: of (?:these|them))? (?:applies|apply)(?=,)"
 )
 _OTHERWISE = re.compile(
     r"(?:otherwise|or else|else|failing that|(?:if|when) (?:not|it is not|it isn't|neither holds|we don't)(?=,)"
@@ -35,7 +36,9 @@ _OTHERWISE = re.compile(
 _WHEN = re.compile(
     r"(if|when|whenever|once|while|as long as|as soon as|after|unless|until|should|with)\s+(.+)", re.IGNORECASE
 )
-_TRAILING = re.compile(r"([^:]+?),?\s(if|when|unless|as long as|whenever)\s(.+)", re.IGNORECASE)
+_TRAILING = re.compile(
+    r"([^:]+?),?\s(if|when|unless|as long as|whenever|in case|provided(?: that)?)\s(.+)", re.IGNORECASE
+)
 _ANSWER = re.compile(
     r"if (?:(so|yes|it is|it does)|(?:no|not|it isn't|it is not))(?=[,:]|\s(?:and|but)\b)"
     r"(?:[,:]|\s(?:and|but) (it is)?(?:if )?)\s*",
@@ -178,6 +181,7 @@ class SentenceReading(Reading):
         """Add a sentence to the current scope."""
         if not text or len(text) > _LONGEST:
             return
+        text = re.sub(r",?\s(?:on the other hand|however|instead),", "", text)
         text = _LABEL.sub("", text, count=1) if _LABEL.match(text) else text
         if self.questions and (answer := _ANSWER.match(text)):
             _, question, guard = self.questions[-1]

@@ -6,7 +6,7 @@ import ast
 import json
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -36,6 +36,7 @@ from lw_torchrl.language.programs import (
 )
 
 _KEYS: Mapping[str, list[str]] = PROGRAM_WORDS["keys"]
+_KNOWN = {word for words in _KEYS.values() for word in words}
 _TYPES = {word: kind for kind, words in PROGRAM_WORDS["types"].items() for word in words}
 _MOST_VALUES = 20_000  # YAML's references can repeat a value
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|//[^\n]*|/\*.*?\*/|#[^\n]*|[^"\[\]{},/#]+|.', re.DOTALL)
@@ -60,6 +61,7 @@ class TreeReading(Reading):
                 self.error = "the tree is too large or nests too deeply"
                 continue
             texts = [action.text.split() for action in actions_of(node)]
+            tree.note_lost(value, [" ".join(words) for words in texts])
             # A list of texts in prose is not a plan.
             is_listing = "{" not in str(value) and not _has_branch(node)
             if (
@@ -92,10 +94,15 @@ def _definitions(value: Any) -> dict[str, Any]:
     """Return the programs and conditions that a text defines by name, such as {"subtrees": {"grasp": ...}}."""
     found = dict[str, Any]()
     stack = [value]
+    said = {text for _, text in _texts(value)}
     for each in stack:  # grows
         if isinstance(each, dict):
+            is_machine = _get(_normal(each), "transitions") is not None
             for key, inner in each.items():
-                if " ".join(words_of(str(key))) in _KEYS["definitions"]:
+                role = " ".join(words_of(str(key)))
+                is_table = isinstance(inner, dict) and inner and said.issuperset(inner)  # all its names are used
+                is_table = is_table and not is_machine and role not in _KEYS["states"] + _KEYS["transitions"]
+                if is_table or role in _KEYS["definitions"]:
                     rows = inner if isinstance(inner, list) else []
                     found |= (
                         inner
@@ -108,6 +115,17 @@ def _definitions(value: Any) -> dict[str, Any]:
         if len(stack) > _MOST_VALUES:
             break
     return found
+
+
+def _texts(value: Any) -> Iterator[tuple[str, str]]:
+    """Yield each text in a value with its key."""
+    stack = [("", value)]
+    for key, each in stack:  # grows
+        if isinstance(each, str):
+            yield key, each.strip()
+        elif isinstance(each, dict | list) and len(stack) < _MOST_VALUES:
+            pairs = each.items() if isinstance(each, dict) else ((key, part) for part in each)
+            stack += [(str(name), part) for name, part in pairs]
 
 
 def _json(text: str) -> Any:
@@ -159,6 +177,16 @@ class _Tree:
     def __init__(self, reading: Reading, text: str, start: int, definitions: Mapping[str, Any]) -> None:
         self.reading, self.text, self.start, self.at, self.count = reading, text, start, 0, 0
         self.definitions, self.opened = definitions, list[str]()  # opened: the definitions that are being read
+        self.conditions = set[str]()  # texts that were read as conditions
+
+    def note_lost(self, value: Any, actions: Collection[str]) -> None:
+        """Note each text that begins with a verb but is in no action or condition of the program."""
+        for key, text in _texts(value):
+            is_action = " ".join(words_of(key)) not in _KEYS["comment"] + _KEYS["name"] and len(text.split()) > 1
+            if is_action and is_verb(command(text).split()) and text not in self.conditions:
+                parts = [part.text for part in actions_of(in_turn(command(text), 1))]
+                if not all(any(part in action for action in actions) for part in parts):
+                    self.reading.note(self.line(text), f"{shown(text)} is left out: no step has it")
 
     def line(self, text: str) -> int:
         """Return the line of the next occurrence of a text."""
@@ -200,6 +228,12 @@ class _Tree:
         return in_turn(words, self.line(text)) if words else None
 
     def object(self, row: dict[str, Any]) -> Node | None:
+        row = {
+            key: each
+            for key, each in row.items()
+            if not (key in _KEYS["otherwise"] and _is_true(each))  # {"else": true, "do": ...}
+            and not (isinstance(each, dict) and key not in _KEYS["states"] and each.keys() <= self.definitions.keys())
+        }
         kind = _TYPES.get(" ".join(words_of(str(_get(row, "type", "")))))
         memory = kind == "memory" or _is_true(_get(row, "memory"))
         kind = "sequence" if kind == "memory" else kind
@@ -210,7 +244,13 @@ class _Tree:
         if (reference := _get(row, "reference")) is not None and str(reference) in self.definitions:
             node = self.leaf(str(reference))
             return node if condition is None or node is None else Branch(condition, node)
-        if (states := _get(row, "states")) is not None:
+        states, exits = _get(row, "states"), _get(row, "transitions")
+        if states is None and isinstance(then, dict) and exits is not None:  # a table of actions, and one of exits
+            by_state = exits if isinstance(exits, dict) else {}
+            for each in exits if isinstance(exits, list) else []:
+                by_state.setdefault(str(each.get("from")) if isinstance(each, dict) else "", []).append(each)
+            states = {name: {"action": each, "transitions": by_state.get(name, [])} for name, each in then.items()}
+        if states is not None:
             return self.object(_normal(states)) if "states" in _normal(states) else self.machine(states, row)
         if kind in ("selector", "sequence", "not") and children is not None:
             parts = tuple(self.children(children))
@@ -271,10 +311,12 @@ class _Tree:
 
     def tests(self, row: Mapping[str, Any]) -> Expression | None:
         """Return the condition of the keys "if", "unless" and the like; None without any."""
-        if (condition := _get(row, "condition")) is None and "unless" not in row:
-            return None
-        unless = [negate(self.condition(row["unless"]))] if "unless" in row else []
-        return all_of([*([] if condition is None else [self.condition(condition)]), *unless])
+        tests = [] if (condition := _get(row, "condition")) is None else [self.condition(condition)]
+        tests += [negate(self.condition(row["unless"]))] if "unless" in row else []
+        if _get(row, "action") is not None:  # {"any": [...], "do": ...}
+            joins = {role: row[role] for role in ("all", "any", "not") if isinstance(row.get(role), list | dict)}
+            tests += [self.condition(joins)] if joins else []
+        return all_of(tests) if tests else None
 
     def typed(self, row: Mapping[str, Any]) -> list[Node]:
         """Return the parts of an object whose keys begin with a type: {"condition 1": ..., "sequence push": ...}."""
@@ -371,6 +413,7 @@ class _Tree:
 
     def said(self, text: str) -> Expression:
         """Convert a text to a condition; a name that the text defines stands for its definition."""
+        self.conditions.add(text)
         if text in self.definitions and text not in self.opened:
             self.opened.append(text)
             condition = self.condition(self.definitions[text])
@@ -423,15 +466,29 @@ class _Tree:
             listed = [listed]
         pairs = list[tuple[Expression, str]]()
         for each in listed if isinstance(listed, list) else []:
-            exit_row = _normal(each) if isinstance(each, dict) else {"to": each}
+            is_pair = isinstance(each, list) and len(each) == 2  # [condition, name]
+            exit_row = (
+                _normal(each)
+                if isinstance(each, dict)
+                else dict(zip(("if", "to"), each, strict=True))
+                if is_pair
+                else {"to": each}
+            )
             test = _get(exit_row, "condition")
             pairs.append((done if test is None else self.condition(test), str(_get(exit_row, "target"))))
         return pairs
 
 
 def _normal(value: Any) -> dict[str, Any]:
-    """Return an object with its keys as lower-case words."""
-    return {" ".join(words_of(str(key))): each for key, each in value.items()} if isinstance(value, dict) else {}
+    """Return an object with its keys as lower-case words; an unknown key such as "entry action" is its last word."""
+    row = {" ".join(words_of(str(key))): each for key, each in value.items()} if isinstance(value, dict) else {}
+    unknown = {key for key in row if key not in _KNOWN and key not in PROGRAM_WORDS["always"]}
+    short = {key: key.split(" ")[-1] for key in unknown if key.count(" ") == 1 and key.split(" ")[0] not in _TYPES}
+    result = dict[str, Any]()
+    for key, each in row.items():
+        last = short.get(key, key)
+        result[last if last in _KNOWN and last not in row.keys() | result.keys() else key] = each
+    return result
 
 
 def _get(row: Mapping[str, Any], role: str, default: Any = None) -> Any:
