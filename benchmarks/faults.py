@@ -46,7 +46,7 @@ class Cast:
     evaluator: Any = None
     simulator: Transform | None = None  # between the policy and the environment
     engine: Any = None  # the simulator of the episodes
-    told: bool = True  # whether attribution is told of the two
+    told: bool = True  # whether attribution knows the simulator transform and the engine
     hidden: bool = False  # whether hooks on modules do not see what is done
     noise: float = 0.1
     told_noise: float | None = None  # None for the right one

@@ -285,6 +285,8 @@ def _tree(notes: Sequence[Row], report: CanonicalReport, decoded: DecodedPlan | 
     A step also has its ``line`` in the text, the ``path`` of heads above it, and why it was ``dropped``. Steps that are
     not in the plan follow at the end, and then the steps that replace the plan's own.
     """
+    from lw_torchrl.language.canonical import SOURCES
+
     count = len(report.written.steps)
     decoded_steps = () if decoded is None else decoded.steps
     at: list[int | None] = [step.line for step in decoded_steps if not step.dropped] or [None] * count
@@ -297,12 +299,9 @@ def _tree(notes: Sequence[Row], report: CanonicalReport, decoded: DecodedPlan | 
     absent = [step for step in decoded_steps if step.dropped]
     tree += [{**nothing, "written": step.written_skill, "line": step.line, "dropped": step.dropped} for step in absent]
     if report.source != "plan":
-        tree.append({"depth": 0, "head": f"{_INSTEAD[report.source]}; policies on canonical plans see:"})
+        tree.append({"depth": 0, "head": f"{SOURCES[report.source]}; policies on canonical plans see:"})
         tree += _branches([{**row, "line": None, "dropped": None} for row in notes[count:]], report.plan, 1)
     return tree
-
-
-_INSTEAD = {"completed": "completed", "fallback": "replaced by the fallback plan"}
 
 
 def _branches(rows: Sequence[Row], plan: lw.ConditionalPlan, depth: int = 0) -> list[Row]:

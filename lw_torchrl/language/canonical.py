@@ -29,7 +29,8 @@ from lw_torchrl.language.tasks import (
 MIN_COVERAGE = 0.75
 """The minimum fraction of typical states that a plan must cover to keep its own conditions."""
 Source = Literal["plan", "completed", "fallback"]
-_SOURCES = {"plan": "its own steps", "completed": "completed", "fallback": "replaced by the fallback plan"}
+SOURCES = {"plan": "its own steps", "completed": "completed", "fallback": "replaced by the fallback plan"}
+"""The wording of each source for a reader."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     explained = []
     for number, step in enumerate(steps):
         written = role_of(step).written
-        reasons = [_SOURCES[source]] if number == 0 else []
+        reasons = [SOURCES[source]] if number == 0 else []
         reasons += [f"as written: {written}"] if written and written != step.skill else []
         explained.append(replace(step, reason="; ".join(reasons)))
     canonical = ConditionalPlan(plan.task, tuple(explained), task)
