@@ -1,5 +1,5 @@
 # make demo    train, evaluate and record a plan-conditioned policy on MT10
-# make test    the fast tests, about eight minutes on two cores; JOBS=4 for four processes instead of two
+# make test    the fast tests, about five minutes on two cores; JOBS=4 for four processes instead of two
 # make test-all    the fast tests and the slow ones
 # make check   ruff and mypy
 # make bench   what everything costs, against rivals (benchmarks/results/performance.md)

@@ -1,2 +1,2 @@
-"""The laboratory beside the package: ``python -m benchmarks`` measures speed, ``python -m benchmarks.paper`` executes
-the paper's experiments, and other modules measure ablations, plans, evaluators and diagnoses."""
+"""Experiments with the package: ``python -m benchmarks`` measures speed, ``python -m benchmarks.paper`` runs the
+paper's experiments, and other modules evaluate ablations, plans, evaluators and diagnoses."""

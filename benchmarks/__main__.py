@@ -16,7 +16,7 @@ from pathlib import Path
 from time import perf_counter, strftime
 from typing import Annotated, Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch and the simulation are not to fight for the cores
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # otherwise torch and the simulation would compete for the cores
 
 import torch
 import tyro
@@ -66,13 +66,13 @@ class Arguments:
     names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Benchmarks to run, all by default; see benchmarks/results/performance.md for their names."""
     quick: bool = False
-    """Run a small version to see that it works; the numbers mean nothing."""
+    """Run a small version as a test; its numbers are meaningless."""
     compiled: Annotated[bool, tyro.conf.arg(name="compile")] = False
     """Also measure torch.compile."""
     out: Path = Path("runs/benchmarks")
     """Folder for results.json and table.md."""
     markdown: bool = False
-    """Print the table of the results in the folder as Markdown, and run nothing."""
+    """Print the table of existing results as Markdown instead of running benchmarks."""
 
 
 def _machine() -> dict[str, Any]:
@@ -103,7 +103,7 @@ def _run(name: str, settings: Settings) -> dict[str, Any]:
     result: dict[str, Any] = {"status": "done", "message": "", "rows": []}
     try:
         rows = BENCHMARKS[name](settings)
-        # Whether a target is met says nothing after a quick run.
+        # After a quick run, it is meaningless whether a target is met.
         result["rows"] = [(replace(row, met=None) if settings.quick else row).to_json() for row in rows]
     except Skipped as reason:
         result.update(status="skipped", message=str(reason))
@@ -120,7 +120,7 @@ def _rows(report: dict[str, Any]) -> list[Row]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run benchmarks; return 1 if one failed. Slow ones do not count as failed."""
+    """Run benchmarks; return 1 if one raised an error. A missed target is not a failure."""
     given = sys.argv[1:] if arguments is None else arguments
     if given[:1] == ["scaling"]:
         return scaling.main(given[1:])
@@ -151,7 +151,7 @@ def main(arguments: list[str] | None = None) -> int:
         result = report["benchmarks"][name] = _run(name, settings)
         told = f": {result['message']}" if result["message"] else ""
         print(f"[{number}/{len(names)}] {name} {result['status']}, {result['seconds']} s{told}", file=sys.stderr)
-        write_json(results, report)  # after each, so that a kill loses one benchmark only
+        write_json(results, report)  # after each benchmark, so that a killed process loses only one
         write_text(args.out / "table.md", as_markdown(_rows(report)))
     print(as_text(_rows(report)))
     print(f"\nwritten to {results} and {args.out / 'table.md'}")

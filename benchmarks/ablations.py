@@ -1,4 +1,4 @@
-"""python -m benchmarks.ablations: measure what each ingredient of a recipe gains, by training without it."""
+"""python -m benchmarks.ablations: measure the contribution of each ingredient of a recipe by training without it."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _few_shot(name: str, **changes: Any) -> Preset:
 
 
 def _zero_shot(name: str, **changes: Any) -> Preset:
-    """Return the recipe with other parts of the members that read plans."""
+    """Return the recipe with changed parts in the members that read plans."""
     members = tuple(replace(one, plan_parts={**one.plan_parts, **changes}) for one in FULL["zero-shot"].members)
     return _without("zero-shot", name, members=members)
 
@@ -100,14 +100,15 @@ PATCHES: Mapping[str, Callable[[], AbstractContextManager[Any]]] = MappingProxyT
         ),
     }
 )
-"""Ingredients that no option removes."""
+"""Context managers for the ablations that no argument of the library can switch on."""
 
 
 @dataclass(frozen=True)
 class Arguments:
     """Train PCBC with one ingredient of the recipe changed at a time.
 
-    If the command is stopped, run it again to resume. A seed of one change takes 3 to 8 minutes few-shot, 3 zero-shot.
+    If the command is stopped, run it again to resume. Each seed of a change takes 3 to 8 minutes for the few-shot
+    recipe, and 3 minutes for the zero-shot recipe.
     """
 
     setting: Setting = "few-shot"
@@ -115,11 +116,11 @@ class Arguments:
     seeds: tuple[int, ...] = (0,)
     """Random seeds of demonstrations, weights and minibatches."""
     steps: int | None = None
-    """Number of minibatches of each training; by default the recipe's."""
+    """Number of minibatches per training run; by default the recipe's."""
     episodes: int = 20
     """Number of evaluation episodes per task."""
     out: Path = Path("runs/reproduce")
-    """Folder of the experiments; reuses datasets and runs of `python -m benchmarks.paper` there."""
+    """Folder of the experiments. Datasets and runs of `python -m benchmarks.paper` in this folder are reused."""
 
 
 def main(arguments: Arguments) -> None:

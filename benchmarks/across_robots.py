@@ -1,5 +1,4 @@
-"""python -m benchmarks.across_robots POLICIES: evaluate Meta-World's policies on a Fetch robot, without demonstrations
-there."""
+"""python -m benchmarks.across_robots POLICIES: evaluate Meta-World policies on a Fetch robot without demonstrations."""
 
 from __future__ import annotations
 
@@ -28,11 +27,11 @@ METHODS = ("pcbc", "dc", "one-hot")
 
 @dataclass(frozen=True)
 class Arguments:
-    """Evaluate the zero-shot policies of each method and training seed with a Fetch.
+    """Evaluate the zero-shot policies of each method and training seed on a Fetch robot.
 
-    PCBC has Fetch's plans. A policy conditioned on descriptions or on task numbers is given what the best adapter could
-    give it: the task of MT10 that asks for the same, and Fetch's numbers in their places of Meta-World's. Actions are
-    turned alike.
+    PCBC policies follow Fetch's plans. A policy that is conditioned on descriptions or task ids gets the best possible
+    adapter: the corresponding task of MT10, and Fetch's values at the positions where Meta-World's observation has
+    them. The axes of actions are converted in the same way for all policies.
     """
 
     policies: tyro.conf.Positional[Path]
@@ -46,13 +45,13 @@ class Arguments:
     seed: int = 3000
     """Random seed of the episodes."""
     max_steps: int = 50
-    """Steps of an episode; success at any step counts."""
+    """Number of steps per episode; success at any step counts."""
     out: Path = Path("runs/across_robots")
     """Folder for results.json and table.md."""
 
 
 class Adapted(TensorDictModuleBase):
-    """A policy without plans, shown Fetch's numbers as Meta-World's."""
+    """A wrapper of a policy without plans that converts Fetch's observations to Meta-World's."""
 
     def __init__(self, actor: TensorDictModuleBase, turned: Any) -> None:
         super().__init__()
@@ -69,9 +68,9 @@ class Adapted(TensorDictModuleBase):
 
 
 def as_metaworld(observation: Tensor, layout: Layout) -> Tensor:
-    """Numbers (B, D) of a layout with one thing in their places of Meta-World's 39, (B, 39)."""
+    """Convert observations (B, D) of a layout with one object to Meta-World's observations (B, 39)."""
     seen = observation.new_zeros(len(observation), METAWORLD.size)
-    for here, there in zip(layout.present, METAWORLD.present, strict=False):  # which has a second thing
+    for here, there in zip(layout.present, METAWORLD.present, strict=False):  # Meta-World has a second object
         seen[:, there] = observation[:, here]
         seen[:, METAWORLD.a_step_before(there)] = observation[:, layout.a_step_before(here)]
     seen[:, METAWORLD.goal : METAWORLD.goal + 3] = observation[:, layout.goal : layout.goal + 3]
@@ -99,7 +98,7 @@ def main(arguments: Arguments) -> None:
 
 
 def trained(folder: Path, method: str, seed: int) -> Any:
-    """The policy that `python -m benchmarks.paper zero-shot` wrote."""
+    """Load a policy written by `python -m benchmarks.paper zero-shot`."""
     return lw.load_actor(folder / method / f"seed{seed}" / "policy.safetensors").eval()
 
 

@@ -35,35 +35,38 @@ DEVELOPMENT = (
     "door-unlock", "faucet-open", "hand-insert", "handle-press-side", "handle-pull-side", "peg-unplug-side",
     "pick-place-wall", "plate-slide-back", "plate-slide-side", "push-wall", "shelf-place", "stick-pull", "sweep",
 )  # fmt: skip
-"""Development tasks outside MT10, on which rules and recipes were chosen."""
+"""Development tasks outside MT10, on which rules and hyperparameters were tuned."""
 TEST = tuple(task for task in lw.MT50 if task not in DEVELOPMENT and task not in lw.MT10)
-"""Test tasks: the other twenty."""
-PARAPHRASES = 10  # of each plan
+"""Test tasks: the other twenty tasks outside MT10."""
+PARAPHRASES = 10  # number of paraphrases of each plan
 OURS, NATURAL = lw.load_plans("MT50", skills="MT10"), lw.load_plans("MT50")
 Rows = Literal[
     "default", "carried", "chooser", "ours", "natural", "own-words", "palm2", "no-points", "dc", "one-hot",
-    "no-roles", "models", "programs", "robustness", "evaluator",
+    "no-roles", "plans-alone", "models", "programs", "robustness", "evaluator",
 ]  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Evaluate the zero-shot policies of each training seed under plans of different authors.
+    """Evaluate the zero-shot policies of each training seed with plans by different authors.
 
-    Every row is one evaluation of the same policies, "dc", "one-hot" and "no-roles" of their own. The plans "default",
-    "carried" and "chooser" read no text: grasp the first thing and slide it to the goal, lift it first, or what
-    geometry tells (benchmarks.blind_plans), by every means that plans have. Rates are of the 40 tasks outside MT10, in
-    the development tasks, on which all was chosen, and the test tasks. Intervals are over tasks and seeds.
+    Each row of the table evaluates the same policies, except that "dc", "one-hot" and "no-roles" are separate policies.
+    "plans-alone" evaluates the demonstrated tasks, MT10, with the networks that read plans instead of the two networks
+    that read descriptions.
+    The plans "default", "carried" and "chooser" are made without reading any text: grasp the first object and slide it
+    to the goal, lift it first, or select a motion by geometry (see benchmarks.blind_plans). Success rates are reported
+    for the development tasks, on which everything was tuned, and for the test tasks, with intervals over tasks and
+    seeds.
     """
 
     policies: tyro.conf.Positional[Path]
-    """Folder `strong` of `python -m benchmarks.paper zero-shot`, beside which there is the folder `no-roles`."""
+    """Folder `strong` of `python -m benchmarks.paper zero-shot`; the folder `no-roles` must be next to it."""
     rows: tuple[Rows, ...] = (*BLIND, "ours", "natural", "palm2", "dc", "one-hot")
     """Plans to evaluate."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds of the trained policies."""
     episodes: int = 20
-    """Number of episodes per task, with seed 10000 + the training's."""
+    """Number of episodes per task; the episodes' seed is 10000 + the training seed."""
     palm2: Path | None = None
     """PaLM 2's plans, a .json file of pairs; required for "palm2"."""
     answers: Path | None = None
@@ -73,7 +76,7 @@ class Arguments:
     evaluator: Path | None = None
     """Learned query evaluator, from `lw-torchrl train-evaluator`; required for "evaluator"."""
     tasks: tuple[str, ...] = (*DEVELOPMENT, *TEST)
-    """Tasks to evaluate, of the 40."""
+    """Tasks to evaluate, among the 40 tasks outside MT10."""
     out: Path = Path("runs/any_plans")
     """Folder for results.json and table.md; existing results are not computed again."""
 
@@ -89,8 +92,10 @@ def main(arguments: Arguments) -> None:
             policy = lw.load_actor(folder_of(arguments, method) / f"seed{seed}" / "policy.safetensors").eval()
             actor = policy if plans is None else following(policy, plans)
             tasks = [task for task in arguments.tasks if plans is None or task in plans]
+            if name == "plans-alone":
+                actor, tasks = policy.others, [*lw.MT10]
             row, _, number = name.partition(", number ")
-            # Of each of ten paraphrases fewer episodes, each with its own initial states.
+            # Run fewer episodes for each of the ten paraphrases, with different initial states.
             episodes = max(1, 2 * arguments.episodes // PARAPHRASES) if number else arguments.episodes
             how: dict[str, Any] = {"episodes_per_task": episodes, "noise_scale": 0.1, "progress": False}
             fixes = 10_000 + seed + 100 * int(number or 0)
@@ -107,7 +112,7 @@ def main(arguments: Arguments) -> None:
 
 
 def following(policy: TensorDictModuleBase, plans: Plans) -> TensorDictModuleBase:
-    """Return the policy with other plans, in the form of those that it was trained with."""
+    """Return the policy with other plans, converted to the form of the plans with which it was trained."""
     actor: TensorDictModuleBase = with_plans(policy, canonical_like(plans, plans_of(policy)))
     return actor
 
@@ -117,25 +122,27 @@ def folder_of(arguments: Arguments, method: str) -> Path:
 
 
 def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans | None]]:
-    """The name, the policy's method and the plans of each row."""
+    """Yield the name, the policy's method and the plans of each row of the table."""
     outside = (*DEVELOPMENT, *TEST)
     for row in arguments.rows:
         if row in ("dc", "one-hot"):
             yield row, row, None
         elif row == "no-roles":
             yield row, row, Plans([OURS[task] for task in outside])
+        elif row == "plans-alone":
+            yield row, "pcbc", None
         elif row in BLIND:
             yield row, "pcbc", blind_plans(row, outside)
         elif row in ("ours", "natural", "evaluator"):
             yield row, "pcbc", Plans([(OURS if row == "ours" else NATURAL)[task] for task in outside])
-        elif row == "own-words":  # whole plans of writers who saw the tasks, their things' names and the query language
+        elif row == "own-words":  # plans by writers who saw the tasks, the names of objects and the query language
             for style, written in read_json(Path(__file__).parent / "data" / "own_words.json", "plans").items():
                 plans = [ConditionalPlan.from_pairs(task, written[task]) for task in outside]
                 yield f"own words, {style}", "pcbc", Plans(plans)
         elif row == "palm2":
             written = lw.load_plans(required(arguments.palm2, "palm2"))
             yield row, "pcbc", Plans([written[task] for task in outside])
-        elif row == "no-points":  # what we named beside the published things is not there; or shapes tell it
+        elif row == "no-points":  # tasks without our named points, or with points found from the objects' shapes
             bare = {task: lw.TASKS[task].published for task in outside}
             for points, tasks in {"no points": bare, "points of shapes": find_points(outside)}.items():
                 written = lw.load_plans(required(arguments.palm2, "palm2"), tasks=lw.TASKS | tasks)
@@ -145,7 +152,7 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
                     "pcbc",
                     blind_plans("default", [written[task].definition for task in outside]),
                 )
-        elif row == "programs":  # a text that cannot be read leaves the policy with the default plan
+        elif row == "programs":  # if a text cannot be parsed, the policy follows the default plan
             for style, texts in read_json(required(arguments.programs, "programs"), "programs").items():
                 plans = [lw.decode_plan(text, task).plan or fallback_plan(task) for task, text in texts.items()]
                 yield f"programs, {style}", "pcbc", Plans(plans)
@@ -170,7 +177,7 @@ def required(path: Path | None, name: str) -> Path:
 
 
 def of_models(file: Path, seed: int) -> Iterator[tuple[str, Plans]]:
-    """For each model and format, one answer a task, drawn blindly."""
+    """Yield the plans of each model and format, from one randomly chosen answer per task."""
     listed: dict[tuple[str, str], dict[str, list[ConditionalPlan | None]]] = {}
     for line in file.read_text("utf-8").splitlines():
         one = json.loads(line)
@@ -180,7 +187,7 @@ def of_models(file: Path, seed: int) -> Iterator[tuple[str, Plans]]:
     for (model, form), tasks in sorted(listed.items()):
         drawn = random.Random(f"{model} {form} {seed}")
         blind = {task: drawn.choice(plans) for task, plans in sorted(tasks.items())}
-        # A model that wrote nothing readable leaves the policy with the default plan.
+        # If the answer cannot be parsed, the policy follows the default plan.
         yield f"{model}, {form}", Plans([plan or fallback_plan(task) for task, plan in blind.items()])
 
 
@@ -200,11 +207,11 @@ WORDS = {
     "toward": ["towards", "toward"],
     "the ": ["", "the ", "a "],
 }
-"""Words of the shipped plans, and others for them."""
+"""Words of the shipped plans and their synonyms."""
 
 
 def reworded(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
-    """Each step in other words, by rule."""
+    """Return the plan with synonyms in each step, by rules."""
     steps = []
     for step in plan.steps:
         text = step.skill
@@ -215,7 +222,7 @@ def reworded(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
 
 
 def by_small_model(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
-    """Each step in the words of `benchmarks.paraphrases`, whatever the model made of it; skills have no commas."""
+    """Return the plan with a paraphrase from `benchmarks.paraphrases` for each step, even if its meaning is wrong."""
     others = read_json(Path(__file__).parent / "data" / "paraphrases.json", "paraphrases")
     said = [
         re.sub(r"[^a-z0-9' -]", "", drawn.choice(others[step.skill])) for step in plan.steps
@@ -225,7 +232,7 @@ def by_small_model(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPl
 
 
 def shuffled(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
-    """The clauses of each condition, and the steps, in another order."""
+    """Return the plan with the steps, and the clauses of each condition, in random order."""
     steps = [
         (" and ".join(map(str, drawn.sample(step.condition.clauses, len(step.condition.clauses)))), step.skill)
         for step in plan.steps
@@ -241,7 +248,7 @@ def one_dropped(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
 
 
 def two_swapped(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
-    """The skills of two steps in each other's place."""
+    """Return the plan with the skills of two steps swapped."""
     skills = [step.skill for step in plan.steps]
     if len(skills) > 1:
         first, second = drawn.sample(range(len(skills)), 2)
@@ -252,7 +259,7 @@ def two_swapped(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
 
 
 def one_wrong(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
-    """One step's skill is another task's."""
+    """Return the plan with one skill replaced by a skill of another task."""
     skills = [step.skill for step in plan.steps]
     skills[drawn.randrange(len(skills))] = drawn.choice(NATURAL.skills)
     return ConditionalPlan.from_pairs(
@@ -261,7 +268,7 @@ def one_wrong(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
 
 
 def of_another(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
-    """The skills of another task's plan, under conditions of this one's first steps."""
+    """Return the skills of another task's plan with the conditions of this plan's first steps."""
     other = NATURAL[drawn.choice([task for task in NATURAL if task != plan.task])]
     conditions = [step.condition for step in plan.steps]
     pairs = [(conditions[number % len(conditions)], step.skill) for number, step in enumerate(other.steps)]
@@ -277,11 +284,11 @@ CHANGES: dict[str, Callable[[ConditionalPlan, random.Random], ConditionalPlan]] 
     "another task's skills": of_another,
     "paraphrased by the small model": by_small_model,
 }
-"""What is done to the natural plans, each with its own draws."""
+"""Changes to the natural plans, each with its own random generator."""
 
 
 def report(found: list[dict[str, Any]], episodes: int) -> str:
-    """Markdown: a line for each row, with the difference to the best of the blind plans, in each seed and task."""
+    """Return a Markdown table of success rates, and their differences from the best plans that read no text."""
     several: dict[str, dict[int, list[dict[str, float]]]] = {}
     for one in found:
         several.setdefault(one["row"], {}).setdefault(one["seed"], []).append(one["success"])
@@ -290,8 +297,9 @@ def report(found: list[dict[str, Any]], episodes: int) -> str:
         for name, seeds in several.items()
     }
     head, lines = ["plans", "seeds"], [[name, str(len(seeds))] for name, seeds in rows.items()]
-    for kind, tasks in (("development", DEVELOPMENT), ("test", TEST)):
-        blind = {name: _rates(rows[name], tasks).mean() for name in BLIND if name in rows}
+    for kind, tasks in (("demonstrated", lw.MT10), ("development", DEVELOPMENT), ("test", TEST)):
+        rated = {name: _rates(rows[name], tasks) for name in BLIND if name in rows}
+        blind = {name: rates.mean() for name, rates in rated.items() if rates.size}
         best = max(blind, key=blind.__getitem__, default="")
         head += [f"{len(tasks)} {kind} tasks", f"minus {best}" if best else "", "better, worse"]
         for line, seeds in zip(lines, rows.values(), strict=True):
@@ -304,13 +312,13 @@ def report(found: list[dict[str, Any]], episodes: int) -> str:
 
 
 def _rates(seeds: dict[int, dict[str, float]], tasks: tuple[str, ...]) -> NDArray[np.float64]:
-    """The rates (seeds, tasks) of those tasks that all seeds have."""
+    """Return the success rates (seeds, tasks) of the tasks that were evaluated for all seeds."""
     known = [task for task in tasks if all(task in rates for rates in seeds.values())]
     return np.array([[rates[task] for task in known] for rates in seeds.values()])
 
 
 def beyond_chance(ours: NDArray[np.float64], theirs: NDArray[np.float64], episodes: int) -> str:
-    """The number of tasks in which the Wilson intervals of all seeds' episodes do not meet: better, and worse."""
+    """Return the numbers of tasks that are significantly better and worse: those with disjoint Wilson intervals."""
     trials = episodes * len(ours)
     intervals = [[wilson_interval(round(sum(rates) * episodes), trials) for rates in both.T] for both in (ours, theirs)]
     pairs = list(zip(*intervals, strict=True))

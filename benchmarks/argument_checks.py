@@ -1,4 +1,4 @@
-"""python -m benchmarks.argument_checks: count the lines that check arguments or word errors, by folder."""
+"""python -m benchmarks.argument_checks: count the lines that check arguments or build error messages, by folder."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ PACKAGE = Path(__file__).resolve().parents[1] / "lw_torchrl"
 
 @dataclass(frozen=True)
 class Arguments:
-    """Count lines that check arguments or word errors: ``raise``, ``if`` blocks that only raise, functions and
-    statements named check..., decorators that check annotations, and the whole of checks.py."""
+    """Count lines that check arguments or build error messages: ``raise``, ``if`` blocks that only raise, functions and
+    statements named check..., decorators that check annotations, and all lines of checks.py."""
 
     package: Path = PACKAGE
     """Folder of a package."""
@@ -38,7 +38,7 @@ def checking_nodes(tree: ast.AST) -> Iterator[ast.stmt | ast.expr]:
 
 
 def checking_lines(path: Path) -> int:
-    """Return the number of lines of a file that check arguments or word errors."""
+    """Return the number of lines of a file that check arguments or build error messages."""
     text = path.read_text("utf-8")
     if path.name.endswith("checks.py"):
         return len(text.splitlines())

@@ -1,4 +1,4 @@
-"""python -m benchmarks.attribution --policy FILE: diagnose the real failures of a policy."""
+"""python -m benchmarks.attribution --policy FILE: diagnose the failures of a policy."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from lw_torchrl.evaluation import plot_failures
 
 @dataclass(frozen=True)
 class Arguments:
-    """Print the causes of a policy's failures, and some failures as examples."""
+    """Print how often each cause made a policy fail, and some of the failures."""
 
     policy: Path
     """File of the policy."""
     tasks: tuple[str, ...] = ()
-    """Tasks, of the policy's; by default MT10 and the development tasks, so that failures in test tasks stay unseen."""
+    """Tasks, among the policy's; by default MT10 and the development tasks, so that failures on test tasks are not
+    inspected."""
     episodes: int = 20
     """Number of episodes per task."""
     seed: int = 2000
     """Random seed of the episodes."""
     max_steps: int = 500
-    """Steps of an episode."""
+    """Number of steps per episode."""
     reference: str = "MT50"
     """Trusted plans: MT10, MT50, a file or a folder."""
     look_at: int = 10

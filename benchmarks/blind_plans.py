@@ -1,4 +1,4 @@
-"""Plans that read no text: one motion for all tasks, or a motion chosen from the geometry of the first states."""
+"""Plans made without reading text: one motion for all tasks, or a motion chosen from the geometry of initial states."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ from lw_torchrl.suites.suite import find_suite
 Array = NDArray[np.float64]
 Blind = Literal["default", "carried", "chooser"]
 BLIND: tuple[Blind, ...] = get_args(Blind)
-_LEVEL = 0.03  # metres by which a goal may be higher or lower than an object that is slid to it
-_OVER_TABLE = 0.03  # metres above object and goal, where something in between is a wall
+_LEVEL = 0.03  # metres, the maximum difference in height between a goal and an object that is slid to it
+_OVER_TABLE = 0.03  # metres above object and goal at which to look for a wall between them
 
 
 def blind_plans(how: Blind, tasks: Iterable[str | Task]) -> Plans:
-    """Plans for tasks without their texts, each with the fallback that all plans have.
+    """Make plans for tasks without reading their texts, with the same fallback steps as all other plans.
 
-    "default" grasps the first object and slides it to the goal; "carried" lifts it first. "chooser" looks at the first
-    states of three episodes: an object on a hinge or rail is pressed if it goes down, pulled if it goes up or to the
-    robot, else pushed to the goal; a free one is slid to a level goal with nothing in between, else carried.
+    "default" grasps the first object and slides it to the goal; "carried" lifts it first. "chooser" selects a motion by
+    the initial states of three episodes. An object on a hinge or rail is pressed if it must move down, pulled if it
+    must move up or toward the robot, and otherwise pushed to the goal. A free object is slid to a goal at the same
+    height if nothing is in between, and otherwise carried.
 
     Example:
         >>> from benchmarks.blind_plans import blind_plans
@@ -56,7 +57,7 @@ def _plan(task: Task, motion: str) -> ConditionalPlan:
 
 
 def _choose(tasks: list[str]) -> dict[str, str]:
-    """Task to its motion: "move", "carry", "push" or "press"."""
+    """Return the motion of each task: "move", "carry", "push" or "press"."""
     engine: Any = find_suite(tasks).make_engine(tasks, reward="sparse", num_threads=1)
     seen: dict[str, list[str]] = {task: [] for task in tasks}
     for seed in range(3):
@@ -77,7 +78,7 @@ def _motion(observation: Array, model: Any, data: Any, shapes: Shapes) -> str:
     if model.jnt_type[first] == mujoco.mjtJoint.mjJNT_FREE:
         level = abs(way[2]) <= _LEVEL and not second.any()
         return "move" if level and not _between(model, data, body[0], at, goal) else "carry"
-    if model.body_dofnum[body[0]] == 1:  # on a hinge or a rail; else on two rails, as a plate is
+    if model.body_dofnum[body[0]] == 1:  # on a hinge or a rail; a plate moves on two rails
         turns = model.jnt_type[first] == mujoco.mjtJoint.mjJNT_HINGE
         along = np.cross(data.xaxis[first], at - data.xanchor[first]) if turns else data.xaxis[first]
         way = along * np.sign(along @ way)
@@ -88,10 +89,10 @@ def _motion(observation: Array, model: Any, data: Any, shapes: Shapes) -> str:
 
 
 def _between(model: Any, data: Any, body: int, at: Array, goal: Array) -> bool:
-    """Whether a ray from an object to the goal, both raised a little, meets something else."""
+    """Return whether a ray from slightly above an object to slightly above the goal hits something else."""
     start, end = (place + np.array([0.0, 0.0, _OVER_TABLE]) for place in (at, goal))
     geom = np.zeros(1, np.int32)
-    for _ in range(10):  # the object's own shapes are passed through
+    for _ in range(10):  # skip the object's own geoms
         share = mujoco.mj_ray(model, data, start, end - start, None, 1, -1, geom)
         if not 0 <= share < 1:
             return False

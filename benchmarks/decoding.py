@@ -1,8 +1,8 @@
-"""python -m benchmarks.decoding FILE [--count 100000]: decode_plan on recorded answers and on mutations of them.
+"""python -m benchmarks.decoding FILE [--count 100000]: test decode_plan on recorded answers and on mutations of them.
 
-FILE holds an answer a line, JSON with "completion", "task" and "format". Says how many give a plan, and what a call
-costs: CPU time of this thread, so that what runs beside does not count. Fails if a text raises, or if a mutation takes
-longer than --most.
+Each line of FILE is an answer: JSON with "completion", "task" and "format". The command prints how many answers give a
+plan, and the CPU time of a call in this thread, which does not depend on other processes. It fails if a text raises an
+error, or if a mutation takes longer than --most.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _WORDS = (
 
 
 def mutated(draw: random.Random, text: str, texts: list[str]) -> str:
-    """A text with up to eight changes: of characters, spans, lines, repetitions, and ends of other texts."""
+    """Return a text with up to eight random changes of characters, spans or lines, also with parts of other texts."""
     for _ in range(draw.randint(1, 8)):
         start = draw.randint(0, len(text))
         end = min(len(text), start + int(draw.expovariate(1 / 40)))
@@ -58,7 +58,7 @@ def mutated(draw: random.Random, text: str, texts: list[str]) -> str:
 
 def main(file: tyro.conf.Positional[Path], count: int = 100_000, seed: int = 0, most: float = 0.05) -> None:
     rows = [json.loads(line) for line in file.read_text("utf-8").splitlines()]
-    for name in lw.TASKS:  # tables are made once
+    for name in lw.TASKS:  # build the cached tables before timing
         lw.decode_plan('if check("the gripper is holding it"):\n    robot.grab("it")', name, "basic_py")
     found = [_timed(row["completion"], row["task"], row["format"]) for row in rows]
     print(f"{len(rows)} answers: {sum(plan for plan, _ in found)} give a plan" + _costs([cost for _, cost in found]))

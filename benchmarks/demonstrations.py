@@ -24,9 +24,9 @@ from lw_torchrl.evaluation import EvaluationResult
 class Arguments:
     """Train and evaluate the recipes of `python -m benchmarks.paper` on fewer demonstrations of each task.
 
-    Zero-shot's rates are of the 40 tasks that were not demonstrated, few-shot's of all 50, by one network instead of
-    four, which is as good in a quarter of the time. The number of training steps is the recipe's whatever the number
-    of demonstrations. What is done already is not done again.
+    Zero-shot success rates are means over the 40 tasks without demonstrations, few-shot rates over all 50 tasks. The
+    few-shot policy is one network instead of four, which is as good and trains four times as fast. The number of
+    training steps is the same for any number of demonstrations. Existing results are reused.
     """
 
     settings: tuple[str, ...] = ("zero-shot", "few-shot")
@@ -44,7 +44,7 @@ class Arguments:
 
 
 PRESET = {"zero-shot": "strong", "few-shot": "one-network"}
-"""Of each setting."""
+"""The preset that is used in each setting."""
 Rates = dict[str, dict[str, dict[int, list[list[float]]]]]
 
 
@@ -59,7 +59,7 @@ def main(arguments: Arguments) -> None:
 
 
 def executed(arguments: Arguments, setting: str, method: str, number: int, seed: int) -> EvaluationResult:
-    """The result of one run, trained or read; its folder says the number of demonstrations."""
+    """Return the result of one run, trained now or read from a folder named after the number of demonstrations."""
     fewer = replace(SETTINGS[setting], episodes=number)
     run = ImitationRun(fewer, method, seed, PRESETS[PRESET[setting]][setting], arguments.episodes)
     plans = lw.load_plans("MT50", skills=run.skills)
@@ -73,7 +73,7 @@ def counts(setting: str, task: str) -> bool:
 
 
 def report(arguments: Arguments, found: Rates) -> None:
-    """Write the numbers, the table and the figure of what there is."""
+    """Write the numbers, the table and the figure of all available results."""
     lines, numbers = [], list(arguments.numbers)
     for setting, methods in found.items():
         for method, each in methods.items():

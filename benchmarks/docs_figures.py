@@ -1,4 +1,4 @@
-"""python -m benchmarks.docs_figures: draw the figures of README and docs from the numbers that our pages print."""
+"""python -m benchmarks.docs_figures: draw the figures of README and docs from the numbers printed there."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ NUMBERS = Path(__file__).parent / "data" / "published_results.json"
 
 @dataclass(frozen=True)
 class Arguments:
-    """Draw the figures of README and docs: with 95 % intervals, legible in light and in dark mode."""
+    """Draw the figures of README and docs, with 95 % intervals and colors for light and dark mode."""
 
     out: Path = Path("docs")
     """Folder for the pictures."""
 
 
 WIDTH = 7.2
-"""Inches, of 100 pixels. With text of 13 points, a picture is legible at half this width."""
+"""Size of a figure in inches of 100 pixels. With 13-point text, a figure is legible at half this width."""
 
 
 def experiments(numbers: Any) -> Any:
-    """Success over all 50 tasks in the paper's three settings."""
+    """Draw success on all 50 tasks in the paper's three settings."""
     figure = new_figure(WIDTH, 3.6)
     panels = figure.subplots(1, 3, sharey=True)
     names, methods, *settings = zip(*numbers["rows"], strict=True)
@@ -42,19 +42,19 @@ def experiments(numbers: Any) -> Any:
 
 
 def zero_shot(numbers: Any) -> Any:
-    """Success on the test tasks, which nobody demonstrated: with plans, generic plans and descriptions."""
+    """Draw success on the test tasks, which have no demonstrations, with plans, generic plans and descriptions."""
     figure = new_figure(WIDTH, 5.4)
     axes = figure.subplots()
     names, methods, rates = zip(*numbers["rows"], strict=True)
     draw_rates(axes, names, rates, [METHOD_COLORS[method] for method in methods])
     figure.suptitle("Success on 20 tasks that nobody demonstrated", fontsize=16, fontweight="bold")
-    caption = "policies trained on 10 other tasks; lines: 95 % intervals, five training seeds"
+    caption = "policies trained on 10 other tasks; lines: 95 % intervals over tasks and seeds"
     figure.supxlabel(caption, fontsize=13)
     return figure
 
 
 def demonstrations(numbers: Any) -> Any:
-    """Success by the number of demonstrations of each demonstrated task."""
+    """Draw success by the number of demonstrations of each demonstrated task."""
     places = [str(number) for number in numbers["numbers"]]
     panels = [
         (title, places, {name: [[rate] for rate in rates] for name, rates in methods.items()})
@@ -64,12 +64,12 @@ def demonstrations(numbers: Any) -> Any:
 
 
 def truth(numbers: Any) -> Any:
-    """Success with late and with wrong answers to conditions."""
+    """Draw success with late and with wrong answers to conditions."""
     return plot_panels(numbers["panels"])
 
 
 def offline(numbers: Any) -> Any:
-    """Success of offline-RL methods on three mixtures of noisy data."""
+    """Draw success of offline-RL methods on three mixtures of noisy data."""
     figure = new_figure(WIDTH, 4.4)
     panels = figure.subplots(1, 3, sharey=True)
     names = [row[0] for row in numbers["rows"]]
@@ -82,7 +82,7 @@ def offline(numbers: Any) -> Any:
 
 
 def scripted(numbers: Any) -> Any:
-    """Success of plans with scripted skills, without training, in the tasks that fail at all."""
+    """Draw success of plans with scripted skills, without training, on the tasks with at least one failure."""
     figure = new_figure(WIDTH, 4.4)
     axes = figure.subplots()
     episodes, successes = numbers["episodes"], numbers["successes"]
@@ -101,7 +101,7 @@ FIGURES = {
     "offline.png": ("offline", offline),
     "scripted.png": ("scripted", scripted),
 }
-"""A picture's name to its numbers and the function that draws it."""
+"""The figures by file name: the file with the numbers, and the function that draws them."""
 
 
 def main(arguments: Arguments) -> None:

@@ -1,4 +1,4 @@
-"""LanguageWorldEnv: what TorchRL's layer adds, resets, construction, and other ways to run Meta-World."""
+"""Benchmarks of LanguageWorldEnv: TorchRL's overhead, resets, construction, and other ways to run Meta-World."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ import lw_torchrl as lw
 from benchmarks.report import Row, Settings, Skipped, bars, compare, part_of, take_turns, timed, under
 from lw_torchrl._util.workers import available_cores
 from lw_torchrl.suites.engine import Engine, EngineStep
-from lw_torchrl.suites.metaworld.plain_engine import make_metaworld_env
+from lw_torchrl.suites.metaworld.environments import make_metaworld_env
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 _SMALL = ("reach", "push", "door-open")
 
 
 class _OnlySimulates(lw.LanguageWorldEnv):
-    """Hands TorchRL the same tensordict after every step of the engine: what is left is TorchRL's own machinery."""
+    """An environment that returns the same tensordict after every engine step, to measure only TorchRL's own time."""
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         n = self.batch_size[0]
@@ -38,7 +38,7 @@ class _OnlySimulates(lw.LanguageWorldEnv):
 
 
 class _Clock:
-    """Makes engines, and counts the seconds spent in their steps."""
+    """A factory of engines that measures the seconds spent in their steps."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -58,7 +58,7 @@ class _Clock:
 
 
 def _tasks(n: int) -> tuple[str, ...]:
-    """The first n of the 50 tasks, spread over the list, so that small batches are of typical tasks too."""
+    """Return n of the 50 tasks, spread over the list, so that small batches also consist of typical tasks."""
     return tuple(lw.MT50[i * len(lw.MT50) // n] for i in range(n)) if n < len(lw.MT50) else lw.MT50
 
 
@@ -76,8 +76,8 @@ def _stepper(env: EnvBase, state: TensorDictBase, steps: int) -> Callable[[], No
 
 
 def overhead(settings: Settings) -> list[Row]:
-    """What is not the engine in a step with QAFTransform and StepCounter, and what of it is TorchRL's own machinery
-    in a step with StepCounter; both beside the physics, which empties the caches."""
+    """Measure the time of a step outside the engine, with QAFTransform and StepCounter, and the time of TorchRL alone,
+    with StepCounter. The physics runs in between, because it empties the caches."""
     rows = []
     for n in (2, 4) if settings.quick else (1, 10, 50, 200):
         rounds, steps = settings.pick(15, 3), settings.pick(max(5, 600 // n), 5)
@@ -118,7 +118,7 @@ def overhead(settings: Settings) -> list[Row]:
 
 
 def reset(settings: Settings) -> list[Row]:
-    """A reset of every row, against Meta-World's own ``env.seed(s); env.reset()``."""
+    """Compare a reset of all rows with Meta-World's own ``env.seed(s); env.reset()``."""
     tasks = _SMALL if settings.quick else lw.MT50
     env = lw.LanguageWorldEnv(tasks, num_threads=1)
     originals = [make_metaworld_env(task) for task in tasks]
@@ -149,7 +149,7 @@ import json, re, resource, sys, time
 import lw_torchrl as lw
 
 def peak():
-    # A fork inherits its parent's ru_maxrss, so that of a process started from here says nothing.
+    # A fork inherits its parent's ru_maxrss, so this value would be wrong for a process started from here.
     try:
         return int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1]) * 1024 / 1e9
     except OSError:
@@ -165,7 +165,7 @@ print(json.dumps({"built": built, "reset": time.perf_counter() - start - built, 
 
 
 def construction(settings: Settings) -> list[Row]:
-    """MT50 with 1000 environments, each time in a fresh process: no model is compiled yet."""
+    """Measure the construction of MT50 with 1000 environments in new processes, in which no model is compiled yet."""
     tasks, n = (_SMALL, 6) if settings.quick else (lw.MT50, 1000)
     found = []
     for _ in bars(range(settings.pick(3, 1)), "construction"):
@@ -184,9 +184,9 @@ def construction(settings: Settings) -> list[Row]:
 
 
 def gym_wrapper(settings: Settings) -> list[Row]:
-    """TorchRL's GymWrapper over Meta-World, one environment after another, as a SerialEnv would step them.
+    """Compare with TorchRL's GymWrapper over Meta-World, one environment after another, as a SerialEnv steps them.
 
-    It is stepped with zero actions and no info reader: seeding, partial resets and success are not to be had from it.
+    The wrapper gets zero actions and has no info reader, because it supports no seeding, partial resets or success.
     """
     from torchrl.envs import GymWrapper
 
@@ -216,7 +216,7 @@ def gym_wrapper(settings: Settings) -> list[Row]:
             now = ours.step_mdp(ours.step(now))
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what the wrapper and Gymnasium say of Meta-World's specs
+        warnings.simplefilter("ignore")  # the wrapper and Gymnasium warn about Meta-World's specs
         found = take_turns({"ours": run, "theirs": theirs}, settings.pick(15, 2))
     ours.close()
     return [
@@ -232,7 +232,7 @@ def gym_wrapper(settings: Settings) -> list[Row]:
 
 
 def envpool(settings: Settings) -> list[Row]:
-    """EnvPool's own C++ Meta-World, a pool of 10 for each of 10 tasks, random actions, 1 and 2 threads."""
+    """Compare with EnvPool's C++ Meta-World: 10 tasks with 10 environments each, random actions, 1 and 2 threads."""
     try:
         import envpool as rival
     except ImportError as error:
@@ -255,7 +255,7 @@ def _envpool(rival: Any, threads: int, settings: Settings) -> list[Row]:
         engine.reset(range(len(rows)), list(range(len(rows))))
     env = lw.LanguageWorldEnv(tasks, num_envs=len(rows), num_threads=threads, reward="dense", max_steps=10**6)
     state = env.reset()
-    order = [i % len(tasks) * n + i // len(tasks) for i in range(len(rows))]  # the environment takes tasks in turn
+    order = [i % len(tasks) * n + i // len(tasks) for i in range(len(rows))]  # our environment assigns tasks in turn
     active = np.ones(len(rows), dtype=bool)
     found: dict[str, list[float]] = {name: [] for name in ("theirs", "sparse", "dense", "env")}
     for _ in bars(range(settings.pick(15, 2)), f"EnvPool, {threads} threads"):

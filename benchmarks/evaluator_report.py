@@ -1,4 +1,4 @@
-"""Reports on learned query evaluators: calibration, confident errors, and how tuning changes what conditions mean."""
+"""Reports on learned query evaluators: calibration, confident errors, and the drift of answers during tuning."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BINS = 15
 
 
 def write_report(evaluator: ClauseEvaluator, data: LabelledQueries, file: Path, most: int) -> str:
-    """Write the score, calibration included, to a .json file and the reliability figure beside it; return a table."""
+    """Write the score with calibration to a .json file, and the reliability figure next to it; return a table."""
     score, bins = score_evaluator(evaluator, data), reliability(evaluator, data)
     errors = {part: calibration_error(counts) for part, counts in bins.items()}
     parts = {part: found.to_json() | {"calibration_error": errors[part]} for part, found in score.parts.items()}
@@ -40,8 +40,8 @@ def write_report(evaluator: ClauseEvaluator, data: LabelledQueries, file: Path, 
 
 @torch.no_grad()
 def reliability(evaluator: ClauseEvaluator, data: LabelledQueries) -> dict[str, Tensor]:
-    """Return, for each held-out part, (15, 3) float64: answers by their probability, in bins of equal width; how many
-    there are, the sum of their probabilities, and how many are true."""
+    """Return (15, 3) float64 for each held-out part. Answers are binned by probability, in bins of equal width; the
+    columns are the number of answers in a bin, the sum of their probabilities, and the number that are true."""
     parts: dict[str, Tensor] = {}
     for part in PARTS:
         for asked in data.parts[part]:
@@ -62,7 +62,7 @@ def calibration_error(counts: Tensor) -> float:
 
 
 def plot_reliability(bins: Mapping[str, Tensor], path: Path) -> None:
-    """Draw the fraction of true answers over their probability, and the number of answers, for each held-out part."""
+    """For each held-out part, draw the fraction of true answers and the number of answers by predicted probability."""
     figure = new_figure(4.2 * len(bins), 5.0)
     both = figure.subplots(2, len(bins), squeeze=False, sharex=True, height_ratios=(3, 1))
     for (part, counts), upper, lower in zip(bins.items(), *both, strict=True):
@@ -83,8 +83,8 @@ def plot_reliability(bins: Mapping[str, Tensor], path: Path) -> None:
 
 @dataclass(frozen=True)
 class WrongAnswer:
-    """A wrong answer of an evaluator of pictures: the clause, its truth, the probability, the ``pixels``
-    (H, W·C, 3) uint8, and, where objects are found by name, the error of their positions in metres."""
+    """A wrong answer of an evaluator of pictures: the clause, its truth value, the predicted probability, the
+    ``pixels`` (H, W·C, 3) uint8, and the errors in metres of the positions of objects that the network locates."""
 
     clause: Clause
     holds: bool
@@ -135,8 +135,11 @@ def plot_wrong_answers(wrong: Sequence[WrongAnswer], path: Path) -> None:
 
 @dataclass(frozen=True)
 class Drift:
-    """How far a step's condition has drifted from its words: the fraction of ``states`` in which it is true
-    (``exact``), in which the evaluator says so (``believed``), and in which both agree (``agreement``)."""
+    """The drift of an evaluator's answers to a step's condition from the exact answers.
+
+    The fields are the fractions of ``states`` in which the condition is true (``exact``), in which the evaluator
+    predicts that it is true (``believed``), and in which both agree (``agreement``).
+    """
 
     task: str
     step: int
@@ -148,10 +151,12 @@ class Drift:
 
 
 def condition_drift(policy: Any, states: TensorDictBase) -> list[Drift]:
-    """Compare the answers of an evaluator, or of a policy's, with the exact ones; the lowest agreement first.
+    """Compare the answers of an evaluator, or of the evaluator in a policy, with the exact answers.
+
+    The condition with the lowest agreement comes first.
 
     Args:
-        policy: an evaluator, or a policy with one.
+        policy: an evaluator, or a policy that contains an evaluator.
         states: (R,) rows with ``observation``, ``task_id`` and the evaluator's inputs.
     """
     (evaluator,) = evaluators_of(policy)
@@ -170,7 +175,7 @@ def condition_drift(policy: Any, states: TensorDictBase) -> list[Drift]:
 
 
 def drift_table(drifts: Sequence[Drift], most: int = 10) -> str:
-    """Return the first drifts as text."""
+    """Return a text table of the first ``most`` drifts."""
     lines = [f"{'agreement':>9} {'exact':>6} {'believed':>8}  condition"]
     for drift in drifts[:most]:
         where = f"{drift.task}, step {drift.step + 1}: {drift.condition}"

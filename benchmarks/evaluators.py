@@ -1,5 +1,4 @@
-"""python -m benchmarks.evaluators: measure what a learned query evaluator in a policy loses, and what tuning it
-gains."""
+"""python -m benchmarks.evaluators: measure the success of policies with learned query evaluators, and after tuning."""
 
 from __future__ import annotations
 
@@ -28,44 +27,44 @@ WHO = ("expert", "scripted", "noisy-30", "random")
 
 @dataclass(frozen=True)
 class Arguments:
-    """Train few-shot policies of MT10 and evaluate them with exact answers, with learned evaluators, and tuned with
-    these. If the command is stopped, run it again to resume.
+    """Train few-shot policies for MT10, and evaluate them with exact answers, with learned evaluators, and after tuning
+    policy and evaluator together. If the command is stopped, run it again to resume.
     """
 
     seeds: tuple[int, ...] = (0, 1, 2)
     """Random seeds of demonstrations, labelled states, weights and minibatches."""
     plans: tuple[str, ...] = ("MT10",)
-    """Plans of the tasks: MT10, a .plan or .json file, a folder, or a .toml file of programs by task. Policies of
-    several plans learn from the same demonstrations, and use the same evaluators."""
+    """Plans for the tasks: MT10, a .plan or .json file, a folder, or a .toml file with a program for each task. With
+    several sources, all policies learn from the same demonstrations and use the same evaluators."""
     labels: tuple[float, ...] = (1.0, 0.01)
     """Fractions of the labelled states to train evaluators on."""
     wrong: float | None = None
-    """Also tune evaluators of all labels that noise in their weights makes wrong: this fraction of their answers to the
-    conditions of MT10's shipped plans, in the demonstrations' states."""
+    """Also tune an evaluator that was trained on all labels and then corrupted by noise on its weights. This is the
+    fraction of wrong answers to the conditions of MT10's shipped plans, in the states of the demonstrations."""
     tasks: tuple[str, ...] = lw.MT10
     policy_steps: int = RECIPE.training_steps
-    """Number of minibatches of a policy's training."""
+    """Number of minibatches to train a policy."""
     steps: int = 6000
-    """Number of minibatches of an evaluator's training."""
+    """Number of minibatches to train an evaluator."""
     tuning_steps: int = 2000
-    """Number of minibatches of the tuning."""
+    """Number of minibatches to tune policy and evaluator."""
     tuning_rate: float = 3e-4
     """Initial learning rate of the tuning."""
     anchors: tuple[float, ...] = (0.0, 0.1)
-    """Weights of `qaf_anchor` in the tuning, one tuning for each."""
+    """Values of `qaf_anchor`; policies are tuned once with each."""
     episodes: int = 20
     """Number of evaluation episodes per task."""
     evaluation_seed: int = 1000
-    """Random seed of the evaluation (not one that demonstrations or labels used)."""
+    """Random seed of the evaluation (use a different one than for demonstrations and labels)."""
     quick: bool = False
-    """Run two tasks, few steps and one seed to see that it works; the numbers mean nothing."""
+    """Run two tasks, few steps and one seed as a test; the numbers are meaningless."""
     out: Path = Path("runs/evaluators")
 
 
 def demonstrations(
     root: Path, tasks: Sequence[str], seed: int, max_steps: int = 500
 ) -> lw.LanguageWorldExperienceReplay:
-    """The recipe's, collected or what is left of it."""
+    """Collect the recipe's demonstrations, or the missing part of them, and open them as a replay buffer."""
     lw.collect_demonstrations(
         tasks,
         episodes_per_task=RECIPE.demonstrations_per_task,
@@ -81,7 +80,7 @@ def demonstrations(
 
 
 def evaluated(file: Path, actor: Any, tasks: Sequence[str], episodes: int, seed: int) -> EvaluationResult:
-    """How an actor does, read from the file if it was done before."""
+    """Evaluate an actor, or read the result from the file if it exists."""
     if file.is_file():
         return EvaluationResult.load(file)
     result = lw.evaluate(
@@ -98,7 +97,7 @@ def evaluated(file: Path, actor: Any, tasks: Sequence[str], episodes: int, seed:
 
 
 def in_front(evaluator: lw.QueryEvaluator, actor: Any) -> TensorDictSequential:
-    """Return the policy that acts on an evaluator's answers, as hard as the exact ones that it was trained on."""
+    """Return a policy that acts on an evaluator's answers, which are hard like the exact answers used in training."""
     evaluator.answers = "hard"
     return TensorDictSequential(evaluator, actor)
 
@@ -112,13 +111,13 @@ def load_plans(source: str) -> lw.Plans:
 
 
 def wrong_rate(policy: Any, states: Any) -> float:
-    """Return the fraction of an evaluator's, or a policy's, answers to conditions that are wrong."""
+    """Return the fraction of wrong answers to conditions by an evaluator, or by the evaluator in a policy."""
     return 1.0 - float(np.mean([drift.agreement for drift in condition_drift(policy, states)]))
 
 
 def add_noise(evaluator: Any, states: Any, rate: float, seed: int) -> None:
-    """Add normal noise to the weights of an evaluator, of a scale at which the fraction ``rate`` of its answers is
-    wrong. The errors stay: equal states get equal answers."""
+    """Add normal noise to the weights of an evaluator so that the fraction ``rate`` of its answers is wrong. The errors
+    are systematic: equal states get equal answers."""
     generator = torch.Generator().manual_seed(seed)
     weights = {name: value.clone() for name, value in evaluator.network.state_dict().items()}
     noise = {name: torch.randn(value.shape, generator=generator) * value.std() for name, value in weights.items()}
@@ -130,7 +129,7 @@ def add_noise(evaluator: Any, states: Any, rate: float, seed: int) -> None:
 
 
 class Bench:
-    """The parts of one seed under one source of plans, each kept in files and done once."""
+    """The policies and evaluators of one seed and one source of plans. Each is made once and stored in a file."""
 
     def __init__(self, args: Arguments, seed: int, source: str) -> None:
         self.args, self.seed, self.shared = args, seed, args.out / f"seed{seed}"
@@ -151,7 +150,7 @@ class Bench:
         return lw.load_actor(self.folder / "policy.safetensors")
 
     def evaluator(self, share: float) -> Any:
-        """One trained on the answers in so large a share of the states; its report is printed."""
+        """Train an evaluator on the answers in a fraction ``share`` of the states, and print its report."""
         roots = [self.shared / "states" / who for who in WHO]
         for who, root in zip(WHO, roots, strict=True):
             noise = (0.0, 0.1, 0.2) if who == "expert" else 0.0
@@ -163,7 +162,7 @@ class Bench:
         states = lw.LanguageWorldExperienceReplay(roots, label="executed")
         labelled = lw.training.LabelledQueries(states, config)
         torch.manual_seed(self.seed)
-        evaluator = lw.modules.StateQueryEvaluator(lw.load_plans("MT10"))  # the network depends on no plan
+        evaluator = lw.modules.StateQueryEvaluator(lw.load_plans("MT10"))  # the network does not depend on the plans
         file = self.shared / f"evaluator-{share:g}.safetensors"
         lw.training.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file).train()
         held_out = labelled if config == most else lw.training.LabelledQueries(states, most)
@@ -173,14 +172,14 @@ class Bench:
         return lw.training.load_evaluator(file, self.plans)
 
     def wrong_evaluator(self, rate: float) -> Any:
-        """One trained on all answers, and then made wrong."""
+        """Return an evaluator that was trained on all answers and then corrupted by noise."""
         evaluator = self.evaluator(1.0)
         shipped = evaluator.with_plans(lw.load_plans("MT10"))  # shares its weights
         add_noise(shipped, self.demonstrations()[:], rate, self.seed)
         return evaluator
 
     def tuned(self, name: str, actor: Any, anchor: float) -> Any:
-        """A policy tuned by its demonstrations' loss, its evaluator too if it has one."""
+        """Tune a policy, and its evaluator if it has one, with the imitation loss on the demonstrations."""
         replay = self.demonstrations()
         if (transform := transform_of(actor)) is not None:
             replay.append_transform(transform)
@@ -206,7 +205,7 @@ class Bench:
         return evaluated(file, actor, self.args.tasks, self.args.episodes, self.args.evaluation_seed)
 
     def run(self) -> Iterable[tuple[str, EvaluationResult]]:
-        """Each row of the table: what answers, and how it went."""
+        """Yield the rows of the table: the source of the answers, and the result."""
         policy = self.policy()
         yield "query answering function", self.success("qaf", policy)
         if self.args.labels:
@@ -235,7 +234,7 @@ class Bench:
 
 
 def table(found: dict[tuple[str, str], list[EvaluationResult]]) -> str:
-    """A line for each kind of answers: mean over the seeds, and the difference from exact ones, seed by seed."""
+    """Return a table with the mean success over seeds, and the difference from exact answers, for each row."""
     rows = []
     for (plans, name), results in found.items():
         exact = np.array([result.mean_success for result in found[plans, "query answering function"]])

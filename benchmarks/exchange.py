@@ -1,4 +1,4 @@
-"""python -m benchmarks.exchange: seconds to export and import 100,000 rows in each format, and megabytes."""
+"""python -m benchmarks.exchange: measure the time to export and import 100,000 rows in each format, and the size."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def _seconds(act: Callable[[], object]) -> float:
 
 
 def main(
-    episodes: Annotated[int, tyro.conf.arg(help="of each MT10 task, 500 steps each")] = 20,
-    repeats: Annotated[int, tyro.conf.arg(help="times each way; the median counts, the first is not counted")] = 3,
+    episodes: Annotated[int, tyro.conf.arg(help="number of 500-step episodes per MT10 task")] = 20,
+    repeats: Annotated[int, tyro.conf.arg(help="number of repetitions; the first is not counted")] = 3,
 ) -> None:
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)

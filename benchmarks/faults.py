@@ -1,4 +1,4 @@
-"""python -m benchmarks.faults: what attribute_failures says of faults that were planted."""
+"""python -m benchmarks.faults: test whether attribute_failures finds planted faults."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ BUILT_ON = (
     *("button-press-topdown", "drawer-open", "push", "plate-slide-back", "plate-slide-side", "handle-press-side"),
     *("door-close", "button-press-wall", "peg-unplug-side", "sweep", "hand-insert"),
 )
-"""Tasks on which causes and margins were chosen."""
+"""Tasks on which the causes and thresholds of the diagnosis were tuned."""
 TASKS = ("pick-place", "coffee-pull", "window-open", "faucet-open", "dial-turn")
 RECORDED = ("observation", "task_id", "qaf", "skill_weights")
 
 
 @dataclass
 class Cast:
-    """What acts and where, with faults."""
+    """The parts of an episode, some of which are faulty: plans, skills, policy, answers, simulator and engine."""
 
     sound: lw.Plans
     scripted: bool
@@ -46,14 +46,14 @@ class Cast:
     evaluator: Any = None
     simulator: Transform | None = None  # between the policy and the environment
     engine: Any = None  # the simulator of the episodes
-    told: bool = True  # whether attribution knows the simulator transform and the engine
-    hidden: bool = False  # whether hooks on modules do not see what is done
+    told: bool = True  # whether attribution gets the simulator transform and the engine
+    hidden: bool = False  # whether hooks on modules cannot observe the change of the action
     noise: float = 0.1
-    told_noise: float | None = None  # None for the right one
-    told_steps: int | None = None  # what attribution is given of each episode
+    told_noise: float | None = None  # the noise that attribution assumes; None for the actual noise
+    told_steps: int | None = None  # number of steps of each episode that attribution gets; None for all
 
     def steps(self, step: int) -> dict[str, int]:
-        """In each task's plan another step."""
+        """Return the index of the faulty plan step of each task, which differs between tasks."""
         return {task: (step + place) % len(plan.steps) for place, (task, plan) in enumerate(self.sound.items())}
 
     def texts(self, step: int) -> dict[str, str]:
@@ -82,7 +82,7 @@ def in_skill(change: Callable[[torch.Tensor], torch.Tensor]) -> Plant:
 
 
 def offset_skill(cast: Cast, step: int) -> None:
-    """In the script's table, or, of a network, as much added to its action."""
+    """Add an offset to a scripted skill's target or, for a learned policy, to its action."""
     if cast.scripted:
         cast.skills = planted.perturbed_skills(cast.sound, cast.steps(step))
     else:
@@ -118,7 +118,7 @@ def both(*plants: Plant) -> Plant:
 
 
 class Fault(NamedTuple):
-    """What is planted, and the causes that are right."""
+    """A fault, and the causes that count as correct diagnoses."""
 
     kind: str
     causes: tuple[str, ...]
@@ -184,13 +184,13 @@ FAULTS: Mapping[str, Fault] = {
     "noise of 1": Fault("noise", ("noise",), setting(noise=1.0)),
     "other noise than told": Fault("noise", ("not reproducible", "noise"), setting(noise=1.0, told_noise=0.1)),
 }
-"""Faults by name. A fault of the motion is in all plan steps; with noise, nothing is planted."""
+"""Faults by name. A motion fault affects all plan steps. For noise, no part is faulty."""
 KINDS = tuple(dict.fromkeys(fault.kind for fault in FAULTS.values()))
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Plant faults and see what is said of them. Stopped and started again it carries on."""
+    """Plant faults and diagnose the failures. If the command is stopped, run it again to resume."""
 
     seed: int = 6000
     """Random seed of the episodes."""
@@ -204,13 +204,13 @@ class Arguments:
     """Number of failures of each fault to diagnose, spread over the tasks."""
     max_steps: int = 150
     learned: Path | None = None
-    """File of the learned policy; by default it is trained once, in the folder --out."""
+    """File of the learned policy; by default, it is trained once and saved in the folder --out."""
     out: Path = Path("runs/faults")
     """Folder for the results, the policy and the tables."""
 
 
 def failures_of(fault: Fault, policy: str, args: Arguments, learned: Any, reference: lw.Plans) -> Iterator[Any]:
-    """What is said of the failures of a fault, in one step of the plans and in the next, and how."""
+    """Yield the diagnoses of a fault's failures, with the fault in one plan step after another."""
     found = 0
     for step in range(_MOST_TURNS):
         if found >= min(_ENOUGH, args.at_most):
@@ -250,7 +250,7 @@ def failures_of(fault: Fault, policy: str, args: Arguments, learned: Any, refere
 
 
 def train(args: Arguments) -> Any:
-    """A policy that imitates the scripted skills under the plans, trained once."""
+    """Return a policy that imitates the scripted skills with the plans; train it unless its file exists."""
     file, data = args.learned or args.out / "learned.safetensors", args.out / "demonstrations"
     if file.is_file():
         return lw.load_actor(file)
@@ -270,7 +270,7 @@ def train(args: Arguments) -> Any:
 
 
 def table(found: Mapping[str, Mapping[str, list[dict[str, Any]]]]) -> str:
-    """What was planted down, what was said across, and below what it comes to."""
+    """Return a table with a row per planted fault and a column per diagnosed cause, followed by a summary."""
     rows, told = [], []
     for name, by_policy in found.items():
         fault = FAULTS[name]
@@ -289,8 +289,8 @@ def table(found: Mapping[str, Mapping[str, list[dict[str, Any]]]]) -> str:
 
 
 def scores(found: Mapping[str, Mapping[str, list[dict[str, Any]]]]) -> dict[tuple[str, str], tuple[int, int, int]]:
-    """Kind of fault and policy to the number of failures whose cause was named right, of all, and of those in which a
-    sound part was blamed."""
+    """Return, for each kind of fault and policy, the number of failures with a correct cause, of all failures, and of
+    failures for which a part without a fault was blamed."""
     counts: dict[tuple[str, str], tuple[int, int, int]] = {}
     for kind in KINDS:
         for policy in ("scripted", "learned"):

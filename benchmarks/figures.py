@@ -28,15 +28,15 @@ METHOD_COLORS = {
     "plan": "#3f8fd2", "generic plan": "#3aa99f", "task description": "#e8833a", "task number": "#5aa85a",
     "scripted skills": "#a678c8", "baseline": "#8d97a3",
 }  # fmt: skip
-"""A method's colour, the same in every figure."""
+"""The color of each method, the same in every figure."""
 METHODS = {"pcbc": "plan", "dc": "task description", "one-hot": "task number", "scripted": "scripted skills"}
 METHODS["PlanConditionedActor"] = "plan"
-"""Names of methods in experiments to their names in figures."""
+"""The name of each method in figures, by its name in experiments."""
 _DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Text columns of even width, as Markdown."""
+    """Return a Markdown table with aligned columns."""
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
     lines = [head, ["-" * width for width in widths], *rows]
     return "\n".join("| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in lines)
@@ -45,7 +45,7 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def draw_rates(
     axes: Axes, names: Sequence[str], rates: Sequence[Sequence[float] | None], colors: Sequence[str]
 ) -> None:
-    """Draw a horizontal bar for each rate, with its interval and its number; the first name is at the top.
+    """Draw a horizontal bar for each rate, with its interval and value; the first name is at the top.
 
     Args:
         rates: for each name (mean, low, high) or (mean,), in [0, 1], or None to draw nothing.
@@ -71,10 +71,10 @@ def draw_rates(
 
 
 def draw_points(axes: Axes, places: Sequence[str], methods: Mapping[str, Sequence[Sequence[float] | None]]) -> None:
-    """Draw each method's rates over ordered places: points with intervals, joined by a thin line.
+    """Draw each method's rates at ordered positions of the x axis: points with intervals, joined by a thin line.
 
     Args:
-        methods: a method to (mean, low, high) or (mean,) for each place, or None to draw nothing there.
+        methods: for each method, (mean, low, high) or (mean,) at each position, or None to draw nothing there.
     """
     looks = _look([*methods]).values()
     for number, ((name, color), rates) in enumerate(zip(looks, methods.values(), strict=True)):
@@ -92,11 +92,11 @@ def draw_points(axes: Axes, places: Sequence[str], methods: Mapping[str, Sequenc
 
 
 Panel = tuple[str, Sequence[str], Mapping[str, Sequence[Sequence[float] | None]]]
-"""Title, places and rates, as :func:`draw_points` reads them."""
+"""Title, positions and rates of a panel; see :func:`draw_points`."""
 
 
 def plot_panels(panels: Sequence[Panel], path: AnyPath | None = None, *, xlabel: str = "") -> Figure:
-    """Draw success over ordered places in panels side by side, with one legend above."""
+    """Draw success at ordered positions, in panels side by side with one legend above."""
     check_image(path)
     with rc_context(NEUTRAL_STYLE):
         figure = new_figure(max(6.0, 3.8 * len(panels)), 4.0)
@@ -122,17 +122,17 @@ def plot_sorted_tasks(
 ) -> Figure:
     """Draw the paper's figure: tasks sorted by success rate.
 
-    A point is the mean over seeds; a line, or a band, spans the worst and the best seed. The legend gives the mean over
-    tasks. Published rates are grey.
+    A point is the mean over seeds; a line or a band extends from the worst to the best seed. The legend shows the mean
+    over tasks. Published rates are gray.
 
     Args:
-        curves: a method's name to its :class:`Summary`, or to (task to its rates, one per seed), in [0, 1]. All have
-            the same tasks.
+        curves: for each method, its :class:`Summary`, or a mapping from task to success rates in [0, 1], one per seed.
+            All methods have the same tasks.
         path, title: as for :func:`plot_success`.
-        published: label to (task to rate), of the same tasks at least.
+        published: for each label, a mapping from task to success rate, with at least the same tasks.
         order: "shared" draws a row for each task, sorted by the first method; "own" sorts the rates of each method
             separately, as the paper does, and draws curves over the rank.
-        of: what a rate is of, for the legend: "seed", "plan".
+        of: what each rate belongs to, for the legend, such as "seed" or "plan".
 
     Example:
         >>> figure = plot_sorted_tasks({"PCBC": {"push": [0.5, 0.7], "reach": [1.0, 0.9]}})
@@ -148,7 +148,7 @@ def plot_sorted_tasks(
     first = next(iter(named))
     for method, rates in named.items():
         if different := sorted(set(named[first]) ^ set(rates)):
-            raise ValueError(f"curves must be of the same tasks; {first!r} and {method!r} do not share {different}")
+            raise ValueError(f"curves must have the same tasks; {first!r} and {method!r} do not share {different}")
     means = {task: float(rates.mean()) for task, rates in named[first].items()}
     tasks = sorted(means, key=lambda task: (means[task], task))
     dashed = {label: _as_rates(f"published[{label!r}]", rates) for label, rates in (published or {}).items()}
@@ -179,7 +179,7 @@ def plot_sorted_tasks(
 
 
 def _look(methods: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return each method's name in figures and its colour."""
+    """Return the name in figures and the color of each method."""
     names = {method: METHODS.get(method, method) for method in methods}
     spare = iter([color for color in METHOD_COLORS.values() if color not in map(METHOD_COLORS.get, names.values())])
     return {method: (name, METHOD_COLORS.get(name) or next(spare, NEUTRAL)) for method, name in names.items()}
@@ -191,7 +191,7 @@ def _label(name: str, rates: Array, of: str, range_shown: str) -> str:
 
 
 def _draw_tasks(methods: Mapping[str, Array], tasks: Sequence[str], of: str) -> Figure:
-    """Draw a row for each task: a point for each method's mean, and a line from its worst seed to its best."""
+    """Draw a row for each task, with a point at each method's mean and a line from its worst to its best seed."""
     figure = new_figure(9.6, 2.0 + 0.27 * len(tasks))
     axes = figure.subplots()
     for k, ((name, color), rates) in enumerate(zip(_look([*methods]).values(), methods.values(), strict=True)):
@@ -210,7 +210,7 @@ def _draw_tasks(methods: Mapping[str, Array], tasks: Sequence[str], of: str) -> 
 
 
 def _draw_ranks(methods: Mapping[str, Array], tasks: Sequence[str], of: str) -> Figure:
-    """Draw each method's rates in ascending order, the worst to best seed shaded."""
+    """Draw each method's rates in ascending order, with a shaded band from the worst to the best seed."""
     figure = new_figure(9.6, 5.4)
     axes = figure.subplots()
     for (name, color), rates in zip(_look([*methods]).values(), methods.values(), strict=True):
@@ -230,11 +230,11 @@ def _draw_ranks(methods: Mapping[str, Array], tasks: Sequence[str], of: str) -> 
 
 
 def _as_rates(argument: str, given: Rates | Summary | Mapping[str, float]) -> dict[str, Array]:
-    """Task to its rates over seeds, (n,) float64."""
+    """Return the rates over seeds, (n,) float64, of each task."""
     if isinstance(given, Summary):
         return dict(zip(given.tasks, given.array.T, strict=True))
     columns = {task: np.atleast_1d(np.asarray(rates, dtype=np.float64)) for task, rates in given.items()}
     if len({len(rates) for rates in columns.values()}) > 1:
-        raise ValueError(f"{argument} must hold a rate per seed for each task, got different numbers of them")
+        raise ValueError(f"{argument} must have one rate per seed for each task, got different numbers of rates")
     check_rates(argument, list(columns.values()))
     return columns

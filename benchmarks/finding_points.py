@@ -1,4 +1,4 @@
-"""Where a hand takes hold of things, or pushes them, found in the shapes of the simulator's model."""
+"""Find the points at which a hand can grasp or push objects, from the shapes in the simulator's model."""
 
 from __future__ import annotations
 
@@ -17,55 +17,56 @@ from lw_torchrl.suites.suite import Suite, find_suite
 
 Array = NDArray[np.float64]
 
-BETWEEN_FINGERS = 0.08  # metres, the widest that is taken hold of
-PADS = 0.045  # metres, from the hand's position down to the ends of its fingers
-_BELOW_TOP = 0.035  # metres of the fingers that go over a thing's top
-_BESIDE = 0.015  # metres from the hand's position to the side of closed fingers that pushes
-_NEAR = 0.03  # metres, how far a thing's surface may be from the position that observations tell
-_STEP = 0.005  # metres between the places that are looked at
+BETWEEN_FINGERS = 0.08  # metres, the maximum width of an object that fits between the fingers
+PADS = 0.045  # metres from the hand's position down to the fingertips
+_BELOW_TOP = 0.035  # metres that the fingertips reach below the top of a grasped object
+_BESIDE = 0.015  # metres from the hand's position to the side of the closed fingers that pushes
+_NEAR = 0.03  # metres, the maximum distance between an object's surface and its observed position
+_STEP = 0.005  # metres between candidate positions
 
 
 @typed
 def find_points(tasks: TaskList = "MT50", *, suite: str | Suite | None = None, episodes: Count = 3) -> dict[str, Task]:
-    """The tasks without the points that people named on their things, and with those that shapes tell.
+    """Return the tasks with points on objects that are found from shapes, instead of the points that people named.
 
-    A thing that lies free and fits between the fingers, which close along y, has a point "... grip" above the place
-    nearest to its position where it does, near its top and no lower than fingers reach. One that is too wide has
-    "... side": where the hand stands to push it to the task's target. Things on hinges or rails keep their positions.
+    A free object that fits between the fingers, which close along y, gets a point "... grip": the hand position at
+    which the fingers grasp the object nearest to its observed position, near its top and above the table. An object
+    that is too wide gets "... side": the hand position from which to push it to the task's target. Objects on hinges or
+    rails get no points.
 
-    Policies on canonical plans use a thing's point wherever a step touches it: give these tasks to
-    :func:`~lw_torchrl.load_plans`.
+    Policies with canonical plans use an object's point for every step that touches the object. To use these points,
+    pass the returned tasks to :func:`~lw_torchrl.load_plans`.
 
     Args:
         tasks: names, :class:`Task` objects, "MT10" or "MT50".
-        suite: theirs, whose engine shows its ``model`` and ``poses``; by default that of the names.
-        episodes: first states that are looked at, of seeds 0 and up; the median counts.
+        suite: the suite of the tasks, whose engine must have ``row_model`` and ``poses``; None for the names' suite.
+        episodes: number of initial states to examine, from seed 0 on; each point is the median.
 
     Returns:
-        Task name to :class:`Task`, its points in metres beside the thing's position.
+        A mapping from name to :class:`Task`. Points are offsets in metres from an object's position.
 
     Raises:
-        ValueError: unknown tasks.
-        TypeError: an engine that does not show its model.
+        ValueError: a task is unknown.
+        TypeError: the engine has no ``model`` or ``poses``.
 
     Example:
         >>> from benchmarks.finding_points import find_points
         >>> find_points("push")["push"].objects[-1].name
         'puck grip'
 
-    Source: ours.
+    Source: original to this library.
     """
     suite = find_suite(tasks, suite)
     named = suite.named_tasks(tasks)
     engine: Any = suite.make_engine(list(named), reward="sparse", num_threads=1)
     try:
-        if not hasattr(engine, "model") or not hasattr(engine, "poses"):
-            raise TypeError(f"suite {suite.name!r} must have an engine with model and poses, as engines of MuJoCo have")
+        if not hasattr(engine, "row_model") or not hasattr(engine, "poses"):
+            raise TypeError(f"the engine of suite {suite.name!r} must have the methods row_model and poses")
         found: dict[str, list[dict[str, tuple[str, Array]]]] = {name: [] for name in named}
         for seed in range(episodes):
             observations = engine.reset(range(len(named)), [seed] * len(named))
             for row, (name, task) in enumerate(named.items()):
-                shapes = Shapes(engine.model(row).model, engine.poses(row))
+                shapes = Shapes(engine.row_model(row).model, engine.poses(row))
                 found[name].append(_points(task, observations[row], shapes))
     finally:
         engine.close()
@@ -73,7 +74,7 @@ def find_points(tasks: TaskList = "MT50", *, suite: str | Suite | None = None, e
 
 
 def _points(task: Task, observation: Array, shapes: Shapes) -> dict[str, tuple[str, Array]]:
-    """Thing's name to what its point is called and where it is, from the thing's position."""
+    """Return, for each object, the kind of its point ("grip" or "side") and the offset from the object's position."""
     hand, *things, goal = task.layout.positions
     found = {}
     for one in task.published.objects[1:]:
@@ -100,7 +101,7 @@ def _with_points(task: Task, seen: list[dict[str, tuple[str, Array]]]) -> Task:
 
 
 def _grip(surface: Array, table: float) -> Array | None:
-    """Where the hand closes its fingers: nearest to the thing's position along x, where it fits between them."""
+    """Return the hand position for a grasp, as near to the object's position along x as it fits between the fingers."""
     best: tuple[float, Array] | None = None
     for x in np.arange(surface[:, 0].min(), surface[:, 0].max() + 1e-9, _STEP):
         near = surface[np.abs(surface[:, 0] - x) <= 4 * _STEP]
@@ -111,7 +112,7 @@ def _grip(surface: Array, table: float) -> Array | None:
 
 
 def _side(surface: Array, way: Array, table: float) -> Array | None:
-    """Where the hand pushes a thing along ``way``: behind the box around it."""
+    """Return the hand position from which to push an object along ``way``, behind its bounding box."""
     length = np.hypot(way[0], way[1])
     if length < _STEP:
         return None
@@ -131,7 +132,8 @@ class Shapes:
         self.model, self.poses = model, poses
 
     def nearest(self, at: Array, hand: Array, dofs: int = 2) -> tuple[int, Array] | None:
-        """The body at that place that moves in ``dofs`` directions or more, and its surface (P, 3) from ``at``."""
+        """Return the body nearest to ``at`` with at least ``dofs`` degrees of freedom, and its surface points (P, 3)
+        relative to ``at``."""
         model = self.model
         robot = model.body_rootid[np.linalg.norm(self.poses.position - hand, axis=1)[1:].argmin() + 1]
         best: tuple[float, tuple[int, Array]] | None = None
@@ -148,7 +150,7 @@ class Shapes:
         return None if best is None else best[1]
 
     def _surface(self, geom: int) -> Array:
-        import mujoco  # importing suites should not wait for it
+        import mujoco  # here, so that importing this module is fast
 
         model, body = self.model, self.model.geom_bodyid[geom]
         points = _surface_points(model, geom)
@@ -163,7 +165,7 @@ class Shapes:
 
 
 def _surface_points(model: Any, geom: int) -> Array:
-    """Points on a geom, in its own frame; of a plane or a height field only its place."""
+    """Return points on a geom in its own frame; for a plane or a height field, only its origin."""
     import mujoco
 
     kind, size = mujoco.mjtGeom(int(model.geom_type[geom])).name, model.geom_size[geom]

@@ -1,6 +1,7 @@
-"""python -m benchmarks.goldens: check what a refactoring must not change.
+"""python -m benchmarks.goldens: check that results which a refactoring must not change are still the same.
 
-The goldens are small files in benchmarks/data/goldens. Each check compares today's code with them and prints one line.
+The golden results are small files in benchmarks/data/goldens. Each check compares the current code with a file and
+prints one line.
 """
 
 from __future__ import annotations
@@ -37,20 +38,21 @@ STATES_PER_TASK = 40
 
 @dataclass(frozen=True)
 class Arguments:
-    """Check that the results of plans, queries, policies and diagnoses have not changed. Exit status 1 if one has."""
+    """Check that the results of plans, queries, policies and diagnoses have not changed; exit with 1 if one has."""
 
     names: tyro.conf.Positional[tuple[Literal["plans", "queries", "actions", "success", "demo", "faults"], ...]] = (
         "plans", "queries", "actions", "success", "demo", "faults",
     )  # fmt: skip
     """Checks to run. Together they take about 8 minutes on two cores."""
     palm2: Path | None = None
-    """PaLM 2's plans, a .json file of (condition, skill) pairs, not shipped. Without it they are not checked."""
+    """PaLM 2's plans, a .json file of (condition, skill) pairs, which is not shipped; by default, they are not
+    checked."""
     write: bool = False
     """Write the goldens instead of checking them."""
 
 
 def canonical_forms(args: Arguments) -> Any:
-    """The canonical form of every plan: source and steps."""
+    """Return the canonical form of every plan: its source and its steps."""
     written: dict[str, lw.Plans] = {
         "natural": lw.load_plans("MT50"),
         "MT10's words": lw.load_plans("MT50", skills="MT10"),
@@ -89,7 +91,7 @@ def check_plans(args: Arguments) -> Iterator[tuple[str, bool]]:
 
 
 def _collect_states() -> dict[str, torch.Tensor]:
-    """States of every task, spread over episodes of the shipped policy and of the scripted skills, with noise."""
+    """Return states of every task, from noisy episodes of the shipped policy and of the scripted skills."""
     observations, tasks = [], []
     actors = (lw.load_actor("few-shot-mt50"), lw.ScriptedSkillActor(lw.load_plans("MT50")))
     for actor, noise in zip(actors, (0.3, 0.6), strict=True):
@@ -165,7 +167,7 @@ def check_actions(args: Arguments) -> Iterator[tuple[str, bool]]:
 
 
 def _evaluations() -> dict[str, tuple[Any, tuple[str, ...]]]:
-    """Name to an actor and the tasks that it is evaluated on."""
+    """Return the actors to evaluate by name, with the tasks of each."""
     natural = lw.load_plans("MT50")
     zero_shot = lw.load_actor(DATA / "zero-shot-seed0.safetensors")
     outside = (*DEVELOPMENT, *TEST)

@@ -1,4 +1,4 @@
-"""python -m benchmarks.images: conditions answered from cameras' pictures, on two tasks, beside exact ones."""
+"""python -m benchmarks.images: compare conditions that are answered from camera images with exact answers."""
 
 from __future__ import annotations
 
@@ -28,29 +28,29 @@ class Arguments:
     """
 
     policy: tuple[Path, ...] = ()
-    """Few-shot policies of MT10, one per seed, for example from benchmarks.evaluators; without, only scripted
-    skills."""
+    """Few-shot policies of MT10, one per seed, for example from benchmarks.evaluators; by default, only scripted skills
+    are evaluated."""
     tasks: tuple[str, ...] = ("button-press-topdown", "drawer-open")
     cameras: tuple[str, ...] = ("corner", "corner3")
     size: int = 64
-    """Height and width of an image, pixels."""
+    """Height and width of an image, in pixels."""
     every: int = 5
-    """Steps between images, in the data and when the evaluator acts."""
+    """Number of steps between images, in the data and in rollouts."""
     behaviours: tuple[int, ...] = (30, 30, 30, 15)
     """Number of rendered episodes per task: of experts, scripted skills, noisy scripted skills and random actions."""
     max_steps: int = 150
-    """Steps of a rendered episode."""
+    """Number of steps per rendered episode."""
     steps: int = 4000
-    """Number of minibatches of the evaluator's training."""
+    """Number of minibatches to train the evaluator."""
     tuning_steps: int = 500
-    """Number of minibatches of 64 rows in the tuning."""
+    """Number of minibatches of 64 rows to tune policy and evaluator."""
     seed: int = 0
     """Random seeds of states, demonstrations, evaluator and tuning."""
     episodes: int = 20
     """Number of evaluation episodes per task."""
     evaluation_seed: int = 1000
     quick: bool = False
-    """Run few steps and episodes to see that it works; the numbers mean nothing."""
+    """Run few steps and episodes as a test; the numbers are meaningless."""
     out: Path = Path("runs/images")
 
     @property
@@ -59,7 +59,7 @@ class Arguments:
 
 
 def frames_per_second(args: Arguments) -> float:
-    """Pictures that one core draws in a second."""
+    """Return the number of images that one core renders per second."""
     env = lw.LanguageWorldEnv(args.tasks)
     env.reset()
     for camera in args.cameras:
@@ -73,7 +73,7 @@ def frames_per_second(args: Arguments) -> float:
 
 
 def evaluator(args: Arguments, plans: lw.Plans) -> Any:
-    """One trained on the answers in the drawn states; report and pictures are left beside it."""
+    """Train an evaluator on rendered states, and save it with a report and figures."""
     config = lw.training.ImageQueryEvaluatorConfig(
         steps=args.steps,
         every=args.every,
@@ -102,7 +102,7 @@ def evaluator(args: Arguments, plans: lw.Plans) -> Any:
 
 
 def tuned(args: Arguments, name: str, actor: Any) -> Any:
-    """The policy and its evaluator, tuned by the loss of imitation through the softmax."""
+    """Tune a policy and its evaluator with the imitation loss, whose gradient passes through the attention."""
     root = args.out / "demonstrations"
     replay = demonstrations(root, args.tasks, args.seed, args.max_steps)
     lw.data.add_pictures(root, **args.pictures)

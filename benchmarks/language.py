@@ -1,4 +1,4 @@
-"""Query answering and scripted skills against the language_world package."""
+"""Compare the speed of query answering and scripted skills with the language_world package."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lw_torchrl.language.queries import Query
 from lw_torchrl.transforms.qaf import plan_program
 
 BATCH = 4096
-ASKED = 64  # states that the rival is asked about in one round; it works state by state
+ASKED = 64  # number of states that language_world evaluates in one round, one state at a time
 
 
 def _rival() -> Any:
@@ -29,14 +29,14 @@ def _rival() -> Any:
 
 
 def _states(tasks: Sequence[str]) -> tuple[list[str], np.ndarray, Tensor]:
-    """The task of each of 4096 states, the states (B, 39) float32, and the ids of the tasks (B,) int64."""
+    """Return the task of each of 4096 states, the states (B, 39) float32, and the task ids (B,) int64."""
     mixed = [tasks[i % len(tasks)] for i in range(BATCH)]
     states = np.random.default_rng(0).uniform(-0.3, 0.9, (BATCH, 39)).astype(np.float32)
     return mixed, states, torch.tensor([lw.task_id(task) for task in mixed])
 
 
 def queries(settings: Settings) -> list[Row]:
-    """A batch of 4096 states of mixed tasks; the rival is asked about 64 of them, and gives the same answers."""
+    """Answer the plans' conditions in 4096 states of mixed tasks; language_world answers 64 of them, identically."""
     rival = _rival()
     mt10, mt50 = lw.load_plans("MT10"), lw.load_plans("MT50")
     asked = {task: lw.supported_queries(task, published_only=True)[: len(plan.steps)] for task, plan in mt50.items()}
@@ -47,7 +47,7 @@ def queries(settings: Settings) -> list[Row]:
 
 
 def branches(settings: Settings) -> list[Row]:
-    """The plans of 50 tasks as trees of branches, where each condition excludes those before it, against the plans."""
+    """Compare the plans of 50 tasks with the same plans as branches, in which each condition excludes earlier ones."""
     plans = lw.load_plans("MT50")
     trees = lw.Plans([as_branches(plan) for plan in plans.values()])
     _, states, task_id = _states(lw.MT50)
@@ -68,7 +68,7 @@ def as_branches(plan: lw.ConditionalPlan) -> lw.ConditionalPlan:
 
 
 def skills(settings: Settings) -> list[Row]:
-    """Every step of every row's plan acts, against as many calls of one skill on one state."""
+    """Compute the action of every plan step of every row, and compare with as many calls of single skills."""
     rival = _rival()
     actor = lw.ScriptedSkillActor(lw.load_plans("MT50"))
     tasks, states, task_id = _states(lw.MT50)
@@ -101,8 +101,11 @@ def _against(
     texts: Mapping[str, Sequence[str]] | None,
     settings: Settings,
 ) -> Row:
-    """``texts`` are what the rival is asked: None for the very queries of the program. It does not know our points,
-    so for plans that name them it is asked as many published queries, of one clause each: less work than ours."""
+    """Compare a query program with language_world, which answers ``texts``; None for the queries of the program.
+
+    language_world does not know the points that we named. For plans that use these points, it answers as many published
+    queries with one clause each, which is less work than ours.
+    """
     same = texts is None
     if texts is None:
         texts = {task: [str(query) for query in listed] for task, listed in program.queries.items()}

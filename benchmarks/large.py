@@ -1,4 +1,4 @@
-"""Large numbers of environments and rows: the time and memory of one must not grow with the number of the others."""
+"""Check that the time per environment, and per row of a dataset, does not grow with the number of them."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from benchmarks.report import Row, Settings, times_as_long, under
 
 STEPS = 500
 PARTS = {"environments": ("construction", "reset", "first step", "later step"), "rows": ("construction", "first batch")}
-GROWTH = 8  # the large number divided by the small one
-MOST = 1.3  # times as long for each
+GROWTH = 8  # the ratio of the large number to the small one
+MOST = 1.3  # the maximum ratio of the times per environment or row
 
 
 def write_dataset(root: Path, rows: int) -> None:
-    """Write a dataset of random rows in episodes of 500 steps of all 50 tasks."""
+    """Write a dataset of random rows, in 500-step episodes of all 50 tasks."""
     from lw_torchrl.data import dataset
     from lw_torchrl.language.tasks import task_id
 
@@ -46,7 +46,7 @@ def write_dataset(root: Path, rows: int) -> None:
 
 
 def measure(kind: str, number: int, root: str) -> dict[str, float]:
-    """Return the processor's seconds for each part on one thread, and the GB of memory used without the imports."""
+    """Return the CPU seconds for each part on one thread, and the memory in GB without the imports."""
     times, before = [process_time()], resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     if kind == "environments":
         env = lw.LanguageWorldEnv("MT50", num_envs=number, num_threads=1)
@@ -70,7 +70,7 @@ def measure(kind: str, number: int, root: str) -> dict[str, float]:
 
 
 def large(settings: Settings) -> list[Row]:
-    """4,096 environments and a dataset of 1,000,000 rows against an eighth of each, all in new processes."""
+    """Compare 4,096 environments, and a dataset of 1,000,000 rows, with an eighth of each, all in new processes."""
     lines: list[Row] = []
     for kind, full, quick in (("environments", 4096, 400), ("rows", 1_000_000, 200_000)):
         number, found = settings.pick(full, quick), []

@@ -1,4 +1,4 @@
-"""evaluate_plans: many plans of the same tasks, carried out by scripted skills in one batched simulation."""
+"""evaluate_plans: execute many plans for the same tasks with scripted skills, in one batched simulation."""
 
 from __future__ import annotations
 
@@ -40,24 +40,26 @@ def evaluate_plans(
     progress: bool = True,
     on_plan: Callable[[int, tuple[bool, ...]], object] | None = None,
 ) -> list[tuple[bool, ...]]:
-    """Carry out many plans, several of a task too, by scripted skills: of each whether it succeeded in each episode.
+    """Execute many plans with scripted skills, and return for each plan whether it succeeded in each episode.
 
-    Every plan meets the same initial states. The result depends neither on ``num_envs`` nor on the plans beside. Where
-    no condition holds, the last step's skill acts.
+    Several plans may belong to the same task. All plans of a task start from the same initial states. The result does
+    not depend on ``num_envs`` or on the other plans. If no condition is true, the last step's skill acts.
 
     Args:
-        plans: every step's skill is the text of a scripted one, as ``DecodedPlan.scripted`` has them.
-        episodes, seed: of each plan, which end at their first success; of the environment and the choice.
-        choose: of several true steps, a "random" one in every state, the paper's rule, or the "first".
-        skills: the scripted skills by text; None for the shipped ones, :func:`~lw_torchrl.load_skills`.
+        plans: plans whose steps have scripted skills, such as ``DecodedPlan.scripted``.
+        episodes: number of episodes of each plan; an episode ends at its first success.
+        seed: random seed of the environment and of the choice among true steps.
+        choose: which step acts if several conditions are true: a "random" one at each time step, as in the paper, or
+            the "first".
+        skills: the scripted skills by text; None for the shipped skills, :func:`~lw_torchrl.load_skills`.
         noise_scale, max_steps, suite, num_envs, num_threads, progress: as for :func:`evaluate`.
-        on_plan: told the index of a plan, and how it fared, once all its episodes are done.
+        on_plan: called with the index of a plan and its successes when all its episodes have ended.
 
     Source: paper section 'LLM Experiments', 'Scripted Skills'.
     """
     if not plans:
-        raise ValueError("plans must be one at least, got none")
-    by_task: dict[str, dict[str, list[int]]] = {}  # fingerprint to the plans of it
+        raise ValueError("plans must contain at least one plan, got none")
+    by_task: dict[str, dict[str, list[int]]] = {}  # for each task, the indices of the plans with each fingerprint
     for index, plan in enumerate(plans):
         by_task.setdefault(plan.task, {}).setdefault(Plans([plan]).fingerprint, []).append(index)
     equal = {task: list(found.values()) for task, found in by_task.items()}
@@ -76,7 +78,7 @@ def evaluate_plans(
                 on_plan(index, in_order(index))
 
     rollout(
-        "carrying out plans",
+        "executing plans",
         policy,
         {task: suite.tasks.get(task, listed[0].definition) for task, listed in different.items()},
         {task: list(range(episodes)) * len(listed) for task, listed in different.items()},
@@ -93,7 +95,10 @@ def evaluate_plans(
 
 
 class _PlanOfRow(nn.Module):
-    """Acts in each row by the plan whose episode it runs, which ``place`` tells: plans of a task one after another."""
+    """A policy that follows a different plan in each row, selected by the episode's position in the task's list.
+
+    The list contains the episodes of the task's first plan, then those of the second plan, and so on.
+    """
 
     row_by_row = True
 
@@ -110,7 +115,7 @@ class _PlanOfRow(nn.Module):
         for task, listed in plans.items():
             definition, first[task] = listed[0].definition, len(rows)
             if any(plan.definition != definition for plan in listed):
-                raise ValueError(f"plans of {task!r} must mean one task, got different definitions of it")
+                raise ValueError(f"plans of {task!r} must have the same task definition, got different definitions")
             asked = list(dict.fromkeys(step.condition for plan in listed for step in plan.steps))
             done = list(dict.fromkeys(step.skill for plan in listed for step in plan.steps))
             conditions[definition], texts[definition] = asked, done
@@ -150,7 +155,7 @@ class _PlanOfRow(nn.Module):
 
 
 def _drawn(*keys: int | NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Numbers that depend only on the keys, (N,) uint64 or what they broadcast to: splitmix64 after each."""
+    """Return pseudorandom numbers uint64 that depend only on the keys, of their broadcast shape (splitmix64)."""
     found = np.zeros(1, dtype=np.uint64)
     for key in keys:
         found = found ^ (np.uint64(key % 2**64) if isinstance(key, int) else key)

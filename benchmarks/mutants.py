@@ -1,4 +1,4 @@
-"""python -m benchmarks.mutants BEFORE AFTER: do the tests of two checkouts find the same planted errors?"""
+"""python -m benchmarks.mutants BEFORE AFTER: check that the tests of two checkouts find the same planted errors."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ OPERATORS: dict[type[ast.AST], str] = {
 
 
 TOP = ("test_checks.py", "test_files.py", "test_importing.py", "test_progress.py", "test_registry.py")
-"""The tests of the files that serve all folders."""
+"""The tests of modules that all folders use."""
 
 
 class Mutant(NamedTuple):
-    """One changed line of one function."""
+    """A mutant: one changed line of a function."""
 
     folder: str
     function: str
@@ -44,15 +44,15 @@ class Arguments:
     """Change one line of the package at a time, and report which changes the tests of two checkouts find."""
 
     before: tyro.conf.Positional[Path]
-    """A checkout."""
+    """Folder of the earlier checkout."""
     after: tyro.conf.Positional[Path]
-    """A later checkout. Only lines that both have, in functions of the same name, are changed."""
+    """Folder of the later checkout. Only lines that both have, in functions with the same name, are changed."""
     seed: int = 0
     """Seed that chooses the lines."""
     count: int = 20
     """Number of lines, spread evenly over the folders of the package."""
     timeout: int = 900
-    """Seconds that the tests of one folder may take; a test that hangs finds the mutant."""
+    """Time limit in seconds for the tests of one folder; a test that hangs counts as finding the mutant."""
     out: Path = Path("runs/mutants.json")
     """File for the results."""
 
@@ -74,7 +74,7 @@ def mutants_of(root: Path) -> dict[Mutant, tuple[Path, int]]:
 
 
 def _operands(node: ast.AST) -> tuple[ast.AST, ast.expr, ast.expr] | None:
-    """Return the first operator of an expression and what stands on its left and right."""
+    """Return the first operator of an expression and its left and right operands."""
     if isinstance(node, ast.Compare):
         return node.ops[0], node.left, node.comparators[0]
     if isinstance(node, ast.BoolOp):
@@ -85,7 +85,7 @@ def _operands(node: ast.AST) -> tuple[ast.AST, ast.expr, ast.expr] | None:
 
 
 def _changes(function: ast.FunctionDef, lines: list[str]) -> Iterator[tuple[int, str]]:
-    """Yield line numbers of a function's body, and the line with one operator, number or truth value changed."""
+    """Yield (number, line) for lines of a function's body with one operator, number or truth value changed."""
     for node in (inner for statement in function.body for inner in ast.walk(statement)):
         number = getattr(node, "lineno", 0) - 1
         line = lines[number]
@@ -103,7 +103,7 @@ def _changes(function: ast.FunctionDef, lines: list[str]) -> Iterator[tuple[int,
 
 
 def choose(before: Path, after: Path, seed: int, count: int) -> list[Mutant]:
-    """Return mutants that both checkouts have, one of each folder in turn, in an order drawn from the seed."""
+    """Return mutants of lines that both checkouts have, cycling over the folders, in a random order."""
     places = mutants_of(after)
     common = sorted(set(mutants_of(before)) & set(places))
     draws = random.Random(seed)

@@ -1,4 +1,4 @@
-"""python -m benchmarks.paraphrases: skills of the shipped plans in other words, by a language model on a server."""
+"""python -m benchmarks.paraphrases: paraphrase the skills of the shipped plans with a language model on a server."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ SHOWN = (
 
 @dataclass(frozen=True)
 class Arguments:
-    """Ask a model for ten paraphrases of each skill. Ours are by SmolLM2, a model of 135 million weights."""
+    """Request paraphrases of each skill from a model. The stored ones are by SmolLM2 with 135 million parameters."""
 
     base_url: str = "http://127.0.0.1:8000/v1"
-    """Address of a server with OpenAI's protocol."""
+    """Address of a server with an OpenAI-compatible API."""
     model: str = "smollm2-135m"
     """Name of the model on the server."""
     number: int = 10
     """Number of paraphrases per skill."""
     temperature: float = 0.8
-    """Largest number of draws, with seeds from 0."""
+    """Maximum number of answers per skill, with seeds from 0."""
     out: Path = Path(__file__).parent / "data" / "paraphrases.json"
     """File of paraphrases by skill; existing ones are kept."""
 
@@ -50,7 +50,7 @@ def main(arguments: Arguments) -> None:
 
 
 def paraphrase(client: Any, arguments: Arguments, skill: str, seed: int) -> str:
-    """The first line of the model's answer, whatever it is: a model that strays is part of what is measured."""
+    """Return the first line of the model's answer unchecked, because wrong paraphrases are part of the experiment."""
     messages: list[dict[str, str]] = [{"role": "system", "content": ASKED}]
     for said, other in (*SHOWN, (skill, "")):
         messages += [{"role": "user", "content": said}, {"role": "assistant", "content": other}]

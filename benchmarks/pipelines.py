@@ -1,4 +1,4 @@
-"""What a user waits for: evaluating a policy, collecting demonstrations."""
+"""Benchmarks of a user's workflow: evaluate a policy, and collect demonstrations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lw_torchrl._util.workers import available_cores
 
 
 def _size(settings: Settings, full: int) -> tuple[tuple[str, ...], int, int]:
-    """Tasks, episodes of each, steps of an episode."""
+    """Return the tasks, the number of episodes per task, and the number of steps per episode."""
     return (lw.MT50[:2], 1, 20) if settings.quick else (lw.MT50, full, 500)
 
 
@@ -23,7 +23,7 @@ def _name(what: str, tasks: tuple[str, ...], episodes: int, steps: int) -> str:
 
 
 def evaluation(settings: Settings) -> list[Row]:
-    """An untrained plan-conditioned policy to the last step, and the expert stopped at its success."""
+    """Evaluate an untrained plan-conditioned policy for full episodes, and the expert until its first success."""
     tasks, episodes, steps = _size(settings, 20)
     options: dict[str, Any] = {"tasks": tasks, "episodes_per_task": episodes, "seed": 1_000, "max_steps": steps}
     torch.manual_seed(0)
@@ -45,7 +45,7 @@ def evaluation(settings: Settings) -> list[Row]:
 
 
 def collection(settings: Settings) -> list[Row]:
-    """Full-length demonstrations of every task, written to disk."""
+    """Collect full-length demonstrations of every task."""
     tasks, episodes, steps = _size(settings, 10)
     settings.folder.mkdir(parents=True, exist_ok=True)
     folder = mkdtemp(prefix="demos-", dir=settings.folder)

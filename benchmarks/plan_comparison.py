@@ -1,6 +1,6 @@
-"""python -m benchmarks.plan_comparison DIR: compare language models by the plans that they wrote.
+"""python -m benchmarks.plan_comparison DIR: compare language models by the success of their plans.
 
-Every answer is decoded, and all plans are carried out by scripted skills in one simulation.
+Every answer is decoded, and scripted skills execute all plans in one simulation.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ class ComparedAnswer:
     format: str
     task: str
     attempt: int
-    steps: int  # of the plan that scripted skills can carry out
-    dropped: int  # clauses for the task that were left out
-    reason: str  # why there is no plan; "" if there is one
-    success: tuple[bool, ...]  # of each episode; all False without a plan
-    plan: ConditionalPlan | None = field(default=None, repr=False)  # what was carried out
+    steps: int  # number of plan steps that scripted skills can execute
+    dropped: int  # number of clauses for the task that were left out
+    reason: str  # why the text has no plan; "" if it has one
+    success: tuple[bool, ...]  # whether each episode succeeded; all False without a plan
+    plan: ConditionalPlan | None = field(default=None, repr=False)  # the executed plan
 
     @property
     def rate(self) -> float:
-        """The share of its episodes that succeeded."""
+        """The fraction of the episodes that succeeded."""
         return sum(self.success) / len(self.success)
 
 
 class PlanComparison:
-    """Answers of models, sorted by model, format, task and attempt, and the settings of their episodes."""
+    """Answers of models, sorted by model, format, task and attempt, with the settings of the episodes."""
 
     def __init__(self, answers: Sequence[ComparedAnswer], settings: Mapping[str, Any]) -> None:
         self.answers = tuple(sorted(answers, key=lambda one: (one.model, one.format, one.task, one.attempt)))
@@ -65,7 +65,7 @@ class PlanComparison:
 
     @property
     def groups(self) -> tuple[Group, ...]:
-        """(model, format) of the answers."""
+        """The distinct (model, format) pairs of the answers."""
         return tuple(self._found)
 
     @property
@@ -73,31 +73,34 @@ class PlanComparison:
         return tuple(dict.fromkeys(model for model, _ in self.groups))
 
     def rates(self, model: str, format: str) -> dict[str, list[float]]:
-        """Task to the success rate of each of its answers."""
+        """Return the success rates of a model's answers in a format, by task."""
         return {task: [one.rate for one in found] for task, found in self._found.get((model, format), {}).items()}
 
     def mean(self, model: str, format: str) -> float:
-        """The mean success rate, of each task over its answers, then over tasks."""
+        """Return the mean success rate over tasks, where each task's rate is the mean over its answers."""
         return _mean([_mean(rates) for rates in self.rates(model, format).values()])
 
     def best_format(self, model: str) -> str:
-        """The model's format of the highest mean."""
+        """Return the format in which the model has the highest mean success rate."""
         return max((format for name, format in self.groups if name == model), key=lambda one: self.mean(model, one))
 
     def best_of(self, model: str, format: str) -> float:
-        """The mean over tasks of the odd episodes' success of the answer best in the even ones; NaN of one episode."""
+        """Return the mean success over tasks of the best answer of each task; NaN if there is only one episode.
+
+        The answer is selected by the even episodes, and its success is measured in the odd episodes.
+        """
         listed = self._found[model, format].values()
         chosen = [max(found, key=lambda one: _mean(one.success[::2])) for found in listed]
         return _mean([_mean(one.success[1::2]) for one in chosen])
 
     def best_plans(self, model: str, format: str) -> dict[str, ConditionalPlan]:
-        """The plan of each task that succeeded most often, of equals the first."""
+        """Return the plan of each task that succeeded most often; the first of several equal ones."""
         listed = self._found[model, format].values()
         best = [max(found, key=lambda one: (one.plan is not None, one.rate)) for found in listed]
         return {one.task: one.plan for one in best if one.plan is not None}
 
     def table(self) -> str:
-        """Markdown: a line for each model and format."""
+        """Return a Markdown table with a row for each model and format."""
         rows = []
         for model, format in self.groups:
             rates = self.rates(model, format)
@@ -110,7 +113,7 @@ class PlanComparison:
         return markdown_table(head, rows)
 
     def task_table(self) -> str:
-        """Markdown: a line for each task, a column for each model, the mean over all its formats and answers."""
+        """Return a Markdown table of mean success with a row for each task and a column for each model."""
         rows = []
         for task in sorted({one.task for one in self.answers}):
             cells = []
@@ -121,7 +124,7 @@ class PlanComparison:
         return markdown_table(["task", *self.models], rows)
 
     def to_json(self) -> dict[str, Any]:
-        """Settings and answers, with the success of each episode as 0 and 1."""
+        """Return the settings and answers as JSON, with the success of each episode as 0 or 1."""
         names = [one.name for one in fields(ComparedAnswer) if one.name not in ("success", "plan")]
         rows = [{name: getattr(one, name) for name in names} | {"success": _bits(one.success)} for one in self.answers]
         return {"format_version": 1, "settings": self.settings, "answers": rows}
@@ -138,12 +141,12 @@ def compare_plans(
     resume: Path | None = None,
     progress: bool = True,
 ) -> PlanComparison:
-    """Decode recorded answers, and carry out all plans by scripted skills in one simulation.
+    """Decode recorded answers, and execute all plans with scripted skills in one simulation.
 
     Args:
         source: a folder or a .jsonl file, as for :class:`~lw_torchrl.planners.FilePlanner`.
         episodes, seed, choose, noise_scale, max_steps: as for :func:`~benchmarks.many_plans.evaluate_plans`.
-        resume: a file for intermediate results, written every few seconds. Plans in it are not carried out again.
+        resume: a file for intermediate results, written every few seconds. Plans in this file are not executed again.
         progress: show progress bars.
 
     Source: paper section 'LLM Experiments'.
@@ -211,10 +214,11 @@ def _bits(success: Sequence[bool]) -> str:
 
 
 def write_report(comparison: PlanComparison, folder: Path) -> list[Path]:
-    """Write results.json, summary.md, models.png (each model in its best format) and formats.png (of the best model)
-    to a folder, and the best plan of each task to best/<model>/<format>/<task>.plan; returns what was written.
+    """Write a report to a folder, and return the paths of the files.
 
-    The figures leave out tasks that some of their curves lack.
+    The files are results.json, summary.md, models.png (each model in its best format), formats.png (all formats of the
+    best model), and the best plan of each task, best/<model>/<format>/<task>.plan. A figure omits tasks that one of its
+    curves lacks.
 
     Source: the paper's figures of section 'LLM Experiments'.
     """
@@ -244,7 +248,7 @@ are 95 % intervals over tasks. The best answer of a task is chosen by the even e
 
 
 def no_plans(comparison: PlanComparison, most: int = 3) -> list[str]:
-    """Lines with the number of answers that have no plan, and the most frequent reasons."""
+    """Return lines with the number of answers that have no plan, and the most frequent reasons."""
     reasons = [one.reason.replace(f" for {one.task}", " for the task") for one in comparison.answers if one.reason]
     if not reasons:
         return []
@@ -255,7 +259,7 @@ def no_plans(comparison: PlanComparison, most: int = 3) -> list[str]:
 
 
 def _write_best(comparison: PlanComparison, folder: Path) -> None:
-    """Write the best plans; .plan files of an earlier report are deleted."""
+    """Write the best plans, and delete .plan files of an earlier report."""
     for format in PLAN_FORMATS:
         for path in folder.glob(f"*/{format}/*.plan"):
             path.unlink()
@@ -276,7 +280,7 @@ def _draw(
     even = {name: {task: found[task][:least] for task in sorted(common)} for name, found in rates.items()}
     published = {}
     for model, format in groups:
-        with suppress(KeyError):  # the paper has no such model
+        with suppress(KeyError):  # the paper has no results for this model
             means = {task: sum(one) / len(one) for task, one in published_plans(model, format).items()}
             if common <= set(means):
                 published[f"{model}, {format}, published"] = {task: means[task] for task in common}
@@ -285,16 +289,17 @@ def _draw(
 
 @dataclass(frozen=True)
 class Arguments:
-    """Compare models by the plans that they wrote. Stopped and started again, the command resumes.
+    """Compare models by the success of their plans. If the command is stopped, run it again to resume.
 
-    Writes results.json, summary.md, models.png and formats.png, and to best/MODEL/FORMAT the plan of each task that
-    succeeded most often, for --plans of other commands.
+    Writes results.json, summary.md, models.png and formats.png, and the most successful plan of each task to
+    best/MODEL/FORMAT, which other commands accept as --plans.
     """
 
     source: tyro.conf.Positional[Path]
-    """A folder MODEL/FORMAT/TASK-ATTEMPT.EXT, as `lw-torchrl plan generate` writes it, or a .jsonl file of answers."""
+    """Folder with files MODEL/FORMAT/TASK-ATTEMPT.EXT, as written by `lw-torchrl plan generate`, or a .jsonl file of
+    answers."""
     episodes: int = 20
-    """Episodes per plan, with the same initial states for all plans of a task."""
+    """Number of episodes per plan; all plans of a task get the same initial states."""
     seed: int = 1000
     """Random seed of initial states, goals and the choice among true steps."""
     choose: Literal["random", "first"] = "random"
@@ -302,7 +307,7 @@ class Arguments:
     noise: float = 0.0
     """Standard deviation of the noise on the executed action."""
     max_steps: int = 500
-    """Steps of an episode."""
+    """Number of steps per episode."""
     out: Path = Path("runs/compare")
     """Folder for the results."""
 

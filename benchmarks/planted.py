@@ -1,4 +1,4 @@
-"""Faults to plant in what acts: in a plan, in a skill, in the answers."""
+"""Faults to plant in plans, skills, policies, answers to conditions, and the simulator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import lw_torchrl as lw
 from lw_torchrl.evaluation.diagnose.replacements import attended
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
+from lw_torchrl.suites.metaworld.environments import MetaWorldEngine
 from lw_torchrl.transforms.qaf import plan_program
 
 OFFSET = 0.1  # metres, along x
@@ -26,7 +26,7 @@ Done = Callable[[TensorDictBase], Tensor]
 
 
 def denied(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
-    """The plan with the first clause of a step's condition denied."""
+    """Return the plan with the first clause of a step's condition negated."""
     pairs = [(str(one.condition), one.skill) for one in plan.steps]
     first, joint, rest = pairs[step][0].partition(" and ")
     first = first.replace(" is not ", " is ") if " is not " in first else first.replace(" is ", " is not ", 1)
@@ -35,13 +35,13 @@ def denied(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
 
 
 def without(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
-    """The plan without a step."""
+    """Return the plan without a step."""
     kept = [(str(one.condition), one.skill) for k, one in enumerate(plan.steps) if k != step]
     return lw.ConditionalPlan.from_pairs(plan.definition, kept)
 
 
 def swapped(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
-    """The plan with the skills of a step and the next one exchanged."""
+    """Return the plan with the skills of a step and the next step swapped."""
     pairs = [(str(one.condition), one.skill) for one in plan.steps]
     other = (step + 1) % len(pairs)
     pairs[step], pairs[other] = (pairs[step][0], pairs[other][1]), (pairs[other][0], pairs[step][1])
@@ -49,14 +49,14 @@ def swapped(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
 
 
 def with_extra(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
-    """The plan with a step too many in front: where a step's condition holds, the skill of the one before it."""
+    """Return the plan with an additional first step: a step's condition with the skill of the step before it."""
     pairs = [(str(one.condition), one.skill) for one in plan.steps]
     extra = (pairs[step][0], pairs[step - 1][1])
     return lw.ConditionalPlan.from_pairs(plan.definition, [extra, *pairs])
 
 
 def perturbed_skills(plans: lw.Plans, steps: Mapping[str, int]) -> Mapping[str, ScriptedSkill]:
-    """The scripted skills, those of a step of each task's plan with a wrong offset."""
+    """Return the scripted skills, with a wrong offset in the skill of one step of each plan."""
     table = dict(lw.load_skills())
     for plan in plans.values():
         skill = table[plan.steps[steps[plan.task]].skill].for_task(plan.task)
@@ -66,12 +66,12 @@ def perturbed_skills(plans: lw.Plans, steps: Mapping[str, int]) -> Mapping[str, 
 
 
 class Liar(TensorDictModuleBase):
-    """An evaluator that takes one condition of each task's plan for its opposite, or for something that never holds.
+    """An evaluator that inverts the answers to one condition of each plan, or always answers that it is false.
 
     Args:
         plans: the plans.
-        steps: task to the condition's step; of a plan with fewer steps, counted on from its first.
-        never: answer no, instead of the opposite.
+        steps: the index of the affected step for each task, modulo the number of the plan's steps.
+        never: answer false instead of inverting the answers.
     """
 
     def __init__(self, plans: lw.Plans, steps: Mapping[str, int], never: bool = False) -> None:
@@ -93,13 +93,13 @@ class Liar(TensorDictModuleBase):
 
 
 class Altered(TensorDictModuleBase):
-    """A policy that is shown another observation, or whose action comes out as another.
+    """A wrapper that changes the observation or the action of a policy.
 
     Args:
         actor: the policy.
-        shown: of the observation (B, 39) and the task_id (B,), what the policy sees in its place.
-        done: of what the policy wrote, the action (B, 4) in its action's place.
-        hidden: call the policy in a way that a hook on modules does not see, as a subclass does.
+        shown: a function that maps the observation (B, 39) and task_id (B,) to the observation for the policy.
+        done: a function that maps the policy's output to the new action (B, 4).
+        hidden: call the policy's ``forward``, so that hooks on modules do not observe the call.
     """
 
     row_by_row = True  # a delay remembers the rows of one call
@@ -125,12 +125,12 @@ class Altered(TensorDictModuleBase):
 
 
 class InStep:
-    """Changes the action while the skill of one step of each plan is in force; of other plans wherever they name it.
+    """A function that changes the action while a certain skill of the task is active.
 
     Args:
         plans: the plans.
-        skills: task to the text of the skill.
-        change: of the action (B, 4), another.
+        skills: the text of the skill for each task.
+        change: a function that maps the action (B, 4) to the changed action.
     """
 
     def __init__(self, plans: lw.Plans, skills: Mapping[str, str], change: Callable[[Tensor], Tensor]) -> None:
@@ -152,22 +152,22 @@ class InStep:
 
 
 def scaled(*factors: float) -> Callable[[Any], Tensor]:
-    """The action times these, of an action or of what a policy wrote."""
+    """Return a function that multiplies an action, or the action in a policy's output, by the factors."""
     return lambda given: _action(given) * torch.tensor(factors)
 
 
 def exchanged(given: Any) -> Tensor:
-    """The action with x and y exchanged."""
+    """Return the action with x and y swapped."""
     return _action(given)[:, [1, 0, 2, 3]]
 
 
 def drifting(effort: float) -> Callable[[Any], Tensor]:
-    """The action with as much added along y."""
+    """Return a function that adds ``effort`` to the action along y."""
     return lambda given: (_action(given) + torch.tensor([0.0, effort, 0.0, 0.0])).clamp(-1.0, 1.0)
 
 
 def timid(given: Any) -> Tensor:
-    """The action with its displacement to the fourth power: small motions hardly happen."""
+    """Return the action with its displacement to the fourth power, which suppresses small motions."""
     action = _action(given)
     return torch.cat((action[:, :3].sign() * action[:, :3].abs() ** 4, action[:, 3:]), -1)
 
@@ -177,7 +177,7 @@ def _action(given: Any) -> Tensor:
 
 
 def fingers(effort: float) -> Done:
-    """The gripper's effort in all steps."""
+    """Return a function that sets the gripper effort to a constant."""
 
     def done(written: TensorDictBase) -> Tensor:
         action = written.get("action").clone()
@@ -188,7 +188,7 @@ def fingers(effort: float) -> Done:
 
 
 def moved_thing(dx: float, dy: float) -> Shown:
-    """The first thing seen in another place."""
+    """Return a function that shifts the observed position of the first object."""
 
     def shown(observation: Tensor, task_id: Tensor) -> Tensor:
         return observation + _at({4: dx, 22: dx, 5: dy, 23: dy}, observation)
@@ -197,12 +197,12 @@ def moved_thing(dx: float, dy: float) -> Shown:
 
 
 def moved_goal(dx: float, dy: float) -> Shown:
-    """The target seen in another place."""
+    """Return a function that shifts the observed position of the goal."""
     return lambda observation, task_id: observation + _at({36: dx, 37: dy}, observation)
 
 
 def late_view(steps: float) -> Shown:
-    """The hand and the things where they were so many steps ago, had they moved as in the last one."""
+    """Return a function that delays the observed positions by ``steps``, extrapolated from the last step's motion."""
 
     def shown(observation: Tensor, task_id: Tensor) -> Tensor:
         seen = observation.clone()
@@ -222,7 +222,8 @@ def _at(numbers: Mapping[int, float], like: Tensor) -> Tensor:
 
 
 class Sensor(Transform):
-    """A camera that stands wrong: policy and query answering function see everything but the hand moved aside."""
+    """A transform that simulates a misplaced camera: all observed positions except the hand's are shifted, for the
+    policy and for the conditions."""
 
     def __init__(self, plans: lw.Plans, aside: float) -> None:
         super().__init__(in_keys=["observation", "task_id"], out_keys=["observation", "qaf"])
@@ -242,7 +243,7 @@ class Sensor(Transform):
 
 
 def turned(degrees: float) -> Callable[[Any], Tensor]:
-    """The action turned about the vertical axis."""
+    """Return a function that rotates the action about the vertical axis."""
     turn = torch.eye(4)
     turn[0, 0] = turn[1, 1] = math.cos(math.radians(degrees))
     turn[0, 1] = math.sin(math.radians(degrees))
@@ -251,7 +252,7 @@ def turned(degrees: float) -> Callable[[Any], Tensor]:
 
 
 class Delayed:
-    """The action, or only some of its entries, so many steps late in each episode."""
+    """A function that delays the action, or some of its entries, by a number of steps in each episode."""
 
     def __init__(self, steps: int, *entries: int) -> None:
         self.steps, self.entries = steps, list(entries)
@@ -259,7 +260,7 @@ class Delayed:
 
     def __call__(self, written: TensorDictBase) -> Tensor:
         action, seen = written.get("action").clone(), written.get("observation")
-        first = (seen[:, :18] == seen[:, 18:36]).all(-1)  # at a reset, the previous state is the present one
+        first = (seen[:, :18] == seen[:, 18:36]).all(-1)  # after a reset, the previous and the current state are equal
         rows = zip(written.get("task_id").tolist(), written.get("episode").tolist(), strict=True)
         for which, row in {which: row for row, which in enumerate(rows)}.items():
             past = self._past[which] = [] if which not in self._past or first[row] else self._past[which]
@@ -269,8 +270,8 @@ class Delayed:
 
 
 class Jammed(Transform):
-    """A simulator that executes another action than it is given: ``change`` of the action (B, 4), or its product with
-    four factors."""
+    """A transform that makes the simulator execute a different action: the result of ``change`` for the action (B, 4),
+    or the action times four factors."""
 
     def __init__(self, *factors: float, change: Callable[[Tensor], Tensor] | None = None) -> None:
         super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
@@ -281,7 +282,7 @@ class Jammed(Transform):
 
 
 class OtherPhysics:
-    """An engine of Meta-World whose MuJoCo models are changed."""
+    """A factory of Meta-World engines with changed MuJoCo models."""
 
     def __init__(self, change: Callable[[Any], None]) -> None:
         self.change = change
@@ -298,7 +299,7 @@ def slippery(model: Any) -> None:
 
 
 def heavy(model: Any) -> None:
-    """Everything that can move freely, or on a joint, is heavy."""
+    """Increase the mass and inertia of all bodies."""
     model.body_mass[:] *= 30.0
     model.body_inertia[:] *= 30.0
 
@@ -308,7 +309,7 @@ def stiff(model: Any) -> None:
 
 
 def slack(model: Any) -> None:
-    """The hand follows its target slowly."""
+    """Make the hand follow its target slowly."""
     model.eq_solref[:, 0] = 1.0
 
 

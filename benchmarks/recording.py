@@ -1,4 +1,4 @@
-"""Time and size of recordings: an episode's page, and one of 50 rows recorded live."""
+"""Benchmarks of the time and size of recordings: the page of an episode, and one of 50 rows recorded live."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EPISODES = 10
 
 
 def recording(settings: Settings) -> list[Row]:
-    """An episode of scripted skills with the robot as it moved; ten of them; one of 50 rows recorded live."""
+    """Record one and ten episodes of scripted skills with the robot's motion, and one of 50 rows during a rollout."""
     steps = settings.pick(500, 20)
     plans = lw.load_plans("MT50")
     rollout = _rollout(plans, steps)
@@ -79,7 +79,7 @@ def _rollout(plans: lw.Plans, steps: int) -> Any:
 
 
 def _live(settings: Settings, plans: lw.Plans, folder: str) -> Row:
-    """The recorder's own time in rollouts of 50 rows, its page included, over the rest of them."""
+    """Measure the recorder's share of the time of rollouts with 50 rows, including the page."""
     steps = settings.pick(500, 20)
     actor = lw.ScriptedSkillActor(plans)
     totals, own = [], []
@@ -111,7 +111,7 @@ def _live(settings: Settings, plans: lw.Plans, folder: str) -> Row:
 
 
 class _Timed(lw.record.RolloutRecorder):
-    """A recorder that counts its own seconds."""
+    """A recorder that measures the seconds spent in its own methods."""
 
     seconds = 0.0
 

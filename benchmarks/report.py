@@ -1,4 +1,4 @@
-"""Results of benchmarks: how they are timed and printed."""
+"""Time benchmarks in turns, and print the results as tables."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Settings:
     """Options of all benchmarks.
 
     Attributes:
-        quick: measure a little of everything: the code runs, the figures mean nothing.
-        compiled: measure ``torch.compile`` too, which takes up to a minute before the first figure.
-        folder: where a benchmark may write.
+        quick: run a small version of everything as a test; the numbers are meaningless.
+        compiled: also measure ``torch.compile``, which takes up to a minute to compile.
+        folder: a folder to which benchmarks may write.
     """
 
     quick: bool
@@ -27,7 +27,7 @@ class Settings:
     folder: Path
 
     def pick(self, full: int, quick: int) -> int:
-        """Return the number for a full run, or for a quick one."""
+        """Return ``quick`` in a quick run, and ``full`` otherwise."""
         return quick if self.quick else full
 
 
@@ -36,17 +36,17 @@ class Row:
     """One line of the table.
 
     Attributes:
-        name: what is measured.
-        ours: the absolute number, of ``unit``.
+        name: the measured quantity.
+        ours: our value, in ``unit``.
         unit: "µs", "s", "GB", ...
-        rival: what it is compared with, "" for a number that stands alone.
-        theirs: the rival's number, of the same unit, measured in turns with ours.
-        ratio: the median over the rounds of ``theirs / ours``, above 1 where ours is faster; or, of a part of a
-            whole and of what does more than the rival, ``ours / theirs``.
-        spread: the quartiles of that ratio over the rounds.
-        target: what the number or the ratio is to reach, "" for none.
-        met: whether it does, None without a target.
-        note: what else there is to know.
+        rival: the name of the alternative, or "" without a comparison.
+        theirs: the value of the alternative, in the same unit, measured in turns with ours.
+        ratio: the median over rounds of ``theirs / ours``, which is above 1 if ours is faster. For a share of a whole,
+            and for code that does more than the alternative, the median of ``ours / theirs``.
+        spread: the quartiles of the ratio over the rounds.
+        target: the target for the value or ratio, or "" without a target.
+        met: whether the target is met; None without a target.
+        note: a remark.
     """
 
     name: str
@@ -65,13 +65,13 @@ class Row:
 
 
 class Skipped(Exception):
-    """A benchmark cannot run here; the message says why."""
+    """An error for a benchmark that cannot run here; the message states the reason."""
 
 
 def take_turns(
     contenders: Mapping[str, Callable[[], object]], rounds: int, *, warm_up: int = 1
 ) -> dict[str, list[float]]:
-    """Seconds of each call, the contenders called in turn, in an order that is reversed every other round."""
+    """Call all contenders in each round, in an order that alternates, and return the seconds of each call by name."""
     names = list(contenders)
     found: dict[str, list[float]] = {name: [] for name in names}
     for number in range(-warm_up, rounds):
@@ -85,14 +85,14 @@ def take_turns(
 
 
 def timed(call: Callable[[], object]) -> float:
-    """Seconds of one call."""
+    """Return the seconds that a call takes."""
     start = perf_counter()
     call()
     return perf_counter() - start
 
 
 def bars(rounds: Iterable[int], what: str) -> Iterable[int]:
-    """``rounds`` with a progress bar, which goes away at the end."""
+    """Return ``rounds`` with a progress bar that disappears at the end."""
     return tqdm(rounds, desc=what, leave=False, delay=1)
 
 
@@ -107,7 +107,7 @@ def compare(
     at_least: float | None = None,
     note: str = "",
 ) -> Row:
-    """A row from the seconds of ours and the rival's in the same rounds; ``scale`` makes units of seconds."""
+    """Return a row from our seconds and the rival's in the same rounds; ``scale`` converts seconds to ``unit``."""
     ratios = [b / a for a, b in zip(ours, theirs, strict=True)]
     row = _row(name, ours, rival, theirs, ratios, unit=unit, scale=scale, note=note)
     if at_least is None:
@@ -126,7 +126,7 @@ def part_of(
     at_most: float | None = None,
     note: str = "",
 ) -> Row:
-    """A row whose ratio is the share that ``part`` has of ``whole``, both in seconds of the same rounds."""
+    """Return a row whose ratio is the share of ``part`` in ``whole``, both in seconds in the same rounds."""
     shares = [a / b for a, b in zip(part, whole, strict=True)]
     row = _row(name, part, whole_name, whole, shares, unit=unit, scale=scale, note=note)
     if at_most is None:
@@ -144,7 +144,7 @@ def times_as_long(
     scale: float,
     at_most: float,
 ) -> Row:
-    """A row whose ratio says how many times as long as ``shorter`` the ``longer`` takes, in the same rounds."""
+    """Return a row whose ratio is ``longer`` divided by ``shorter``, both in seconds in the same rounds."""
     row = part_of(name, longer, shorter_name, shorter, unit=unit, scale=scale, at_most=at_most)
     return replace(row, target=f"ratio ≤ {at_most:g}")
 
@@ -175,7 +175,7 @@ def _row(
 
 
 def under(name: str, ours: float, unit: str, most: float | None = None, note: str = "") -> Row:
-    """A row that is a number alone, with a limit or without."""
+    """Return a row without a comparison, with or without an upper limit."""
     target = "" if most is None else f"≤ {most:g} {unit}"
     return Row(name, ours, unit, target=target, met=None if most is None else ours <= most, note=note)
 
@@ -207,13 +207,13 @@ def _cells(row: Row) -> tuple[str, ...]:
 
 
 def as_text(rows: Sequence[Row]) -> str:
-    """A table for the terminal."""
+    """Return the rows as a table for the terminal."""
     cells = [COLUMNS, *map(_cells, rows)]
     widths = [max(len(line[column]) for line in cells) for column in range(len(COLUMNS))]
     return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells)
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
-    """The same table for benchmarks/results/performance.md."""
+    """Return the rows as a Markdown table for benchmarks/results/performance.md."""
     cells = [COLUMNS, tuple("---" for _ in COLUMNS), *map(_cells, rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in cells) + "\n"

@@ -1,5 +1,4 @@
-"""Minibatches in exact proportions: equal numbers from every task; a target's demonstration beside the base tasks; rows
-that come while batches are drawn."""
+"""Benchmarks of samplers with exact proportions: balanced tasks, co-learning with a target, and growing buffers."""
 
 from __future__ import annotations
 
@@ -36,7 +35,7 @@ def _rows(count: int, task: torch.Tensor) -> TensorDict:
 
 
 def _compare(name: str, draws: Mapping[str, Callable[[], object]], rounds: int, rival: str, targets: bool) -> list[Row]:
-    """Rows for "ours" against "ensemble", which ``rival`` describes, and "gather"."""
+    """Return rows that compare "ours" with "ensemble", which ``rival`` describes, and with "gather"."""
 
     def several(draw: Callable[[], object]) -> Callable[[], None]:
         def run() -> None:
@@ -72,7 +71,7 @@ def _compare(name: str, draws: Mapping[str, Callable[[], object]], rounds: int, 
 
 
 def _balanced(settings: Settings, count: int) -> list[Row]:
-    """200 out of 500 000 rows of 50 tasks: ours, TorchRL's ensemble of a buffer per task, a bare gather."""
+    """Draw 200 of 500,000 rows of 50 tasks with our sampler, TorchRL's ensemble of buffers, and a plain gather."""
     rows = _rows(count, torch.arange(count) * TASKS // count)
     size = count // TASKS
     balanced = TensorDictReplayBuffer(storage=TensorStorage(rows), sampler=lw.TaskBalancedSampler(), batch_size=BATCH)
@@ -91,7 +90,7 @@ def _balanced(settings: Settings, count: int) -> list[Row]:
 
 
 def _co_learning(settings: Settings, count: int) -> list[Row]:
-    """100 of one demonstration beside 10 of each MT10 task, of two datasets that are joined."""
+    """Draw 100 rows of one demonstration and 10 rows of each MT10 task, from two joined datasets."""
     size = count // len(lw.MT10)
     base = _rows(count, torch.tensor([lw.task_id(task) for task in lw.MT10]).repeat_interleave(size))
     target = _rows(500, torch.full((500,), lw.task_id(TARGET)))
@@ -115,7 +114,7 @@ def _co_learning(settings: Settings, count: int) -> list[Row]:
 
 
 def _growing(settings: Settings, count: int) -> list[Row]:
-    """100 rows come, then a batch of 200 is drawn by task."""
+    """Add 100 rows to a buffer, then draw a balanced batch of 200 rows."""
     task = torch.arange(count) % TASKS
     rows, come = _rows(count, task), 100
     batch = _rows(come, torch.arange(come) % TASKS)
@@ -156,6 +155,6 @@ def _growing(settings: Settings, count: int) -> list[Row]:
 
 
 def samplers(settings: Settings) -> list[Row]:
-    """A batch of 200 out of 500 000 rows, against TorchRL's own, a bare gather, and grouping all rows again."""
+    """Draw a batch of 200 of 500,000 rows; compare with TorchRL's ensemble, a plain gather, and regrouping all rows."""
     count = settings.pick(500_000, 5_000)
     return [*_balanced(settings, count), *_co_learning(settings, count), *_growing(settings, count)]

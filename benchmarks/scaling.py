@@ -1,7 +1,7 @@
-"""python -m benchmarks scaling [--gpu]: every core and the GPU of this machine, measured by one script.
+"""python -m benchmarks scaling [--gpu]: measure the speed on all cores and on the GPU of this machine.
 
-The script needs no network and none of the packages of the tests. Each benchmark runs in a process of its own, which
-prints rows as it measures them: after an error, or if a GPU fails, the next benchmark follows.
+The script needs neither a network nor the packages for tests. Each benchmark runs in a separate process and prints
+rows as it measures them, so that the next benchmark runs even after an error or a failure of the GPU.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Arguments:
-    """Measure how the library scales over the cores and on the GPU of this machine."""
+    """Measure the speed of the library on several cores and on the GPU of this machine."""
 
     gpu: bool = False
     """Also measure the GPU."""
     rows: tuple[str, ...] = ()
-    """Names of the benchmarks to run; all of this machine by default."""
+    """Names of the benchmarks to run; by default all that this machine supports."""
     quick: bool = False
-    """Run a small version to see that it works; the numbers mean nothing."""
+    """Run a small version as a test; its numbers are meaningless."""
     seconds: float = 460.0
     """Start no benchmark after this many seconds."""
     folder: Path = Path("runs/scaling")
     """Folder for demonstrations, policies and scaling.json; results are also written to $OUT, if it is set."""
     here: bool = False
-    """Run in this process."""
+    """Run the benchmarks in this process."""
 
     @property
     def device(self) -> str:
@@ -64,7 +64,7 @@ class Arguments:
 
     @property
     def demos(self) -> Path:
-        """Demonstrations of MT50, which the first benchmark that needs them collects."""
+        """The folder of demonstrations of MT50. The first benchmark that needs them collects them."""
         root = self.folder / "mt50"
         if not (self.folder / "done").exists():
             size: Row = {"episodes_per_task": self.pick(10, 1), "max_steps": self.pick(500, 20), "progress": False}
@@ -76,7 +76,7 @@ class Arguments:
         return quick if self.quick else full
 
     def each(self, step: Callable[[], Any], number: int) -> float:
-        """Return the milliseconds of a call: the mean of ``number`` calls, waiting for the device at the end only."""
+        """Return the mean milliseconds of ``number`` calls, with a single synchronization at the end."""
 
         def steps() -> None:
             for _ in range(number):
@@ -100,7 +100,7 @@ class Arguments:
         return lw.BehavioralCloningTrainer(actor, replay, config, device=self.device, progress=False, **options)
 
     def measured(self, name: str, trainer: Training, number: int, **more: Any) -> Row:
-        """Measure a trainer's step after its warm-up, and the part of the captured graph."""
+        """Measure a trainer's step after the warm-up, and the share of the captured graph."""
         losses = [trainer.step() for _ in range(5)]
         row: Row = {"row": name, "ms": self.each(trainer.step, self.pick(number, 2))}
         captured = trainer._captured
@@ -110,7 +110,7 @@ class Arguments:
 
 
 def machine(args: Arguments) -> Iterator[Row]:
-    """The machine, and the versions of the packages."""
+    """Yield the machine and the package versions."""
     from importlib.metadata import version
 
     row: Row = {"row": "machine", "cores": available_cores(), "python": sys.version.split()[0]}
@@ -119,7 +119,7 @@ def machine(args: Arguments) -> Iterator[Row]:
 
 
 def cloning(args: Arguments) -> Iterator[Row]:
-    """A step of behavioral cloning, eager and captured, and the GPU memory."""
+    """Measure a step of behavioral cloning, without and with a CUDA graph, and the GPU memory."""
     for recipe, (_, size) in RECIPES.items():
         for capture in (False, True):
             trainer = args.cloning(recipe, capture=capture)
@@ -131,7 +131,7 @@ def cloning(args: Arguments) -> Iterator[Row]:
 
 
 def few_shot(args: Arguments) -> Iterator[Row]:
-    """The few-shot experiment's network: the seconds of its training and of its evaluation, and its success."""
+    """Measure the training time, evaluation time and success of the few-shot experiment's network."""
     steps = args.pick(12_000, 5)
     trainer = args.cloning("few-shot", steps)
     seconds = timed(trainer.train)
@@ -145,7 +145,7 @@ def few_shot(args: Arguments) -> Iterator[Row]:
 
 
 def stacked(args: Arguments) -> Iterator[Row]:
-    """Twenty one-shot models in one step."""
+    """Measure a training step of twenty stacked one-shot models."""
     plans, number = lw.load_plans("MT50"), args.pick(20, 2)
     for capture in (False, True):
         torch.manual_seed(0)
@@ -163,7 +163,7 @@ def stacked(args: Arguments) -> Iterator[Row]:
 
 
 def offline(args: Arguments) -> Iterator[Row]:
-    """The offline losses, batch 250."""
+    """Measure training steps of the offline losses with batch size 250."""
     plans = lw.load_plans("MT50")
     for name, distribution in DISTRIBUTIONS.items():
         torch.manual_seed(0)
@@ -177,7 +177,7 @@ def offline(args: Arguments) -> Iterator[Row]:
 
 
 def evaluators(args: Arguments) -> Iterator[Row]:
-    """Query evaluators of states and of pictures (random ones, since only the time is measured)."""
+    """Measure training steps of query evaluators on states and on pictures, which are random."""
     plans, training, modules = lw.load_plans("MT50"), lw.training, lw.modules
     kinds: Any = {
         "states": (modules.StateQueryEvaluator, training.QueryEvaluatorConfig),
@@ -195,7 +195,7 @@ def evaluators(args: Arguments) -> Iterator[Row]:
 
 
 def rollout(args: Arguments) -> Iterator[Row]:
-    """A rollout of an environment on the device with a policy there, and the same on the CPU."""
+    """Measure a rollout of environment and policy on the device, and on the CPU."""
     plans = lw.canonical_plans(lw.load_plans("MT50"), fallback=True)
     for device in dict.fromkeys((args.device, "cpu")):
         torch.manual_seed(0)
@@ -212,7 +212,7 @@ def rollout(args: Arguments) -> Iterator[Row]:
 
 
 def workers(args: Arguments) -> Iterator[Row]:
-    """The collection of MT50 by experts, and the evaluation of an untrained policy, over processes."""
+    """Measure the collection of expert demonstrations of MT50, and an evaluation, with several worker processes."""
     size = {"episodes_per_task": args.pick(10, 1), "max_steps": args.pick(500, 5)}
     run: dict[str, Any] = {"workers": available_cores(), "progress": False} | size
     torch.manual_seed(0)
@@ -225,11 +225,11 @@ def workers(args: Arguments) -> Iterator[Row]:
 
 
 def threads(args: Arguments) -> Iterator[Row]:
-    """Steps a second of the engine and the environment by threads, beside as many processes."""
+    """Measure steps per second of engine and environment by number of threads, and of as many processes."""
     from benchmarks.scaling_threads import rows
 
     most = available_cores()
-    for number in dict.fromkeys((most, 1, 4, 8, 2)):  # the most important first, in case that the time ends
+    for number in dict.fromkeys((most, 1, 4, 8, 2)):  # the most important first, in case the time runs out
         if number <= most:
             for row in rows([number], seconds=0.02 if args.quick else 0.12):
                 yield {"row": "threads"} | row
@@ -243,7 +243,7 @@ BENCHMARKS: dict[str, Callable[[Arguments], Iterator[Row]]] = {
 
 
 def _run(name: str, args: Arguments, seconds: float) -> list[Row]:
-    """Run a benchmark in a process of its own, print its rows and return them."""
+    """Run a benchmark in a separate process, print its rows and return them."""
     command = [sys.executable, "-m", "benchmarks.scaling", "--here", "--rows", name, "--folder", str(args.folder)]
     command += [f"--{flag}" for flag in ("gpu", "quick") if getattr(args, flag)]
     rows, error = [], ""

@@ -1,4 +1,4 @@
-"""Simulation with more threads, and with more processes, which is the limit: ``rows(threads, sizes)``."""
+"""Benchmarks of the simulation with several threads, compared with the upper limit, several processes."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 ROUNDS = 7
 ROWS_OF_A_PROCESS = 50
-LEAST = {50: 0.55, 400: 0.75}  # share of the limit that 16 threads should reach
-MOST_SERIAL = 0.06  # of a step of 400 rows on two cores
+LEAST = {50: 0.55, 400: 0.75}  # minimum fraction of the limit for 16 threads, by number of rows
+MOST_SERIAL = 0.06  # maximum serial share of a step of 400 rows on two cores
 
 
 def rows(threads: Sequence[int], sizes: Sequence[int] = (50, 400), seconds: float = 0.5) -> list[dict[str, Any]]:
-    """Measure steps a second of the engine (compiled, and in Python threads) and of ``LanguageWorldEnv``.
+    """Measure steps per second of the engine (compiled, and in Python threads) and of ``LanguageWorldEnv``.
 
-    For each size and number of threads, the contenders run in turn, ``seconds`` at a time. ``limit`` is the rate of as
-    many processes of 50 rows and one thread each. ``serial`` is the share of the compiled engine's step in which one
-    thread works and the others wait.
+    For each size and number of threads, the contenders run in turn, ``seconds`` at a time. ``limit`` is the rate of the
+    same number of processes, with 50 rows and one thread each. ``serial`` is the share of the compiled engine's step in
+    which one thread works and the others wait.
     """
     torch.set_num_threads(1)
     limits = {count: _processes(count, seconds) for count in threads}
@@ -40,7 +40,7 @@ def rows(threads: Sequence[int], sizes: Sequence[int] = (50, 400), seconds: floa
 
 
 def threads(settings: Settings) -> list[Row]:
-    """1, 2, 4, 8 and 16 threads, as far as there are cores, against as many processes and against one thread."""
+    """Compare 1, 2, 4, 8 and 16 threads, up to the number of cores, with as many processes and with one thread."""
     counts = [count for count in (1, 2, 4, 8, 16) if count <= available_cores()]
     found = rows(counts, (5,) if settings.quick else (50, 400), seconds=0.02 if settings.quick else 0.5)
     lines = []
@@ -76,7 +76,7 @@ def _actions(n: int) -> np.ndarray:
 
 
 class _Engine:
-    """An engine that is stepped for a while."""
+    """A contender that steps an engine."""
 
     def __init__(self, engine: VectorizedEngine, n: int) -> None:
         self.n, self.engine, self.number, self.parallel = n, engine, 0, 0.0
@@ -97,7 +97,7 @@ class _Engine:
 
 
 class _Env:
-    """A ``LanguageWorldEnv`` that is stepped for a while, as TorchRL's collectors step it."""
+    """A contender that steps a ``LanguageWorldEnv`` as TorchRL's collectors do."""
 
     def __init__(self, n: int, threads: int) -> None:
         self.n, self.number = n, 0
@@ -111,7 +111,7 @@ class _Env:
 
 
 def _play(contender: Any, seconds: float) -> float:
-    """Step for ``seconds``; return the steps a second of all rows."""
+    """Step a contender for ``seconds``; return the steps per second, summed over rows."""
     start, number = perf_counter(), 0
     while (passed := perf_counter() - start) < seconds:
         contender.step()
@@ -159,7 +159,7 @@ def _measure(n: int, threads: int, limit: float, seconds: float) -> dict[str, An
 
 
 def _processes(count: int, seconds: float) -> float:
-    """Return the steps a second of ``count`` processes together."""
+    """Return the total steps per second of ``count`` processes."""
     context = multiprocessing.get_context("spawn")
     barrier, rates = context.Barrier(count), context.Queue()
     processes = [context.Process(target=_one_process, args=(barrier, rates, seconds)) for _ in range(count)]

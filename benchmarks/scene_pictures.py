@@ -1,4 +1,4 @@
-"""python -m benchmarks.scene_pictures: the recorded scene of six tasks beside MuJoCo's pictures, to look at."""
+"""python -m benchmarks.scene_pictures: draw the recorded scenes of six tasks next to MuJoCo's images."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ import tyro
 from rerun.experimental import ViewerClient
 
 import lw_torchrl as lw
-from lw_torchrl.envs.seeding import episode_seed
+from lw_torchrl.envs.rows import episode_seed
 from lw_torchrl.record.entities import STEP_TIME
 from lw_torchrl.record.meshes import Motion, log_motion
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 EYE, TARGET = np.array([0.75, 0.0, 0.65]), np.array([-0.05, 0.6, 0.15])
-FIELD_OF_VIEW = 55.0  # degrees, of rerun's eye
+FIELD_OF_VIEW = 55.0  # degrees, of Rerun's camera
 WIDTH, HEIGHT = 440, 330
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Draw six tasks at the first success of an expert's episode, ours on the left and MuJoCo's on the right."""
+    """Draw six tasks at the first success of an expert: the recorded scene on the left, MuJoCo's image on the right."""
 
     tasks: tuple[str, ...] = ("drawer-open", "window-close", "hammer", "peg-insert-side", "basketball", "coffee-pull")
     out: Path = Path("runs/scene.png")
@@ -46,7 +46,7 @@ class Arguments:
 
 
 def _at_success(task: str, seed: int) -> tuple[Motion, Any]:
-    """The bodies at the first success of an expert, as one row; and a picture by MuJoCo."""
+    """Return the poses of the bodies at the first success of an expert, as one row, and MuJoCo's image."""
     with torch.no_grad():
         env = lw.LanguageWorldEnv(task, seed=seed, num_threads=1)
         rollout = env.rollout(200, lw.ExpertActor(task))[0]
@@ -57,7 +57,7 @@ def _at_success(task: str, seed: int) -> tuple[Motion, Any]:
     engine.reset([0], [episode_seed(task, seed, 0)])
     for step in range(steps):
         engine.step(rollout["next", "executed_action"][step : step + 1].numpy(), np.ones(1, bool))
-    poses, model = engine.poses(0), engine.model(0)
+    poses, model = engine.poses(0), engine.row_model(0)
     motion = Motion(model, poses.position[None].astype(np.float32), poses.quaternion[None].astype(np.float32))
     picture = _mujocos_picture(model.model, engine._rows[0]._data)
     engine.close()
@@ -111,7 +111,7 @@ def _loaded(client: Any) -> Any:
 
 
 def _patiently(call: Callable[[], Any], tries: int = 60) -> Any:
-    """What a call gives in the end, on a machine that draws in software."""
+    """Repeat a call until it succeeds, because software rendering is slow, and return the result."""
     for _ in range(tries - 1):
         try:
             return call()
@@ -125,7 +125,7 @@ def main(arguments: Arguments) -> None:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     command = [sys.executable, "-m", "rerun", "--headless", "--bind", "127.0.0.1", "--port", port]
-    quiet = {**os.environ, "RUST_LOG": "off"}  # its messages lie over the views
+    quiet = {**os.environ, "RUST_LOG": "off"}  # otherwise the viewer's messages cover the views
     viewer = subprocess.Popen(command, env=quiet, stderr=subprocess.DEVNULL, start_new_session=True)
     client = _patiently(lambda: ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy"))
     figure, axes = plt.subplots(3, 4, figsize=(12, 7.4), layout="constrained")

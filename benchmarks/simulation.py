@@ -1,4 +1,4 @@
-"""The engine against the physics alone and Meta-World's own step."""
+"""Benchmarks of the engine, compared with the physics alone and with Meta-World's own step."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from metaworld.policies import ENV_POLICY_MAP
 
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings, bars, compare, times_as_long
-from lw_torchrl.suites.metaworld.plain_engine import make_metaworld_env
+from lw_torchrl.suites.metaworld.environments import make_metaworld_env
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
-CHUNK = 25  # steps that one contender makes before it is the next one's turn
+CHUNK = 25  # number of steps of a contender before the next contender's turn
 SUBSTEPS = 5
-MOCAP_QUATERNION = (1.0, 0.0, 1.0, 0.0)  # Meta-World puts it there at every step
+MOCAP_QUATERNION = (1.0, 0.0, 1.0, 0.0)  # Meta-World sets this orientation at every step
 
 
 class _Physics:
-    """Copies of the states of Meta-World's environments, on the same models, moved by MuJoCo alone."""
+    """Copies of the MuJoCo states of Meta-World environments, on the same models, stepped by MuJoCo alone."""
 
     def __init__(self, envs: list[Any], *, look: bool) -> None:
         self._look = look
         self.pairs = [(env.model, copy(env.data)) for env in envs]
 
     def play(self, mocap: np.ndarray, control: np.ndarray) -> float:
-        """Seconds of physics along mocap (T, N, 3) and control (T, N, 2); what sets the controls is not counted."""
+        """Return the seconds of physics for mocap positions (T, N, 3) and controls (T, N, 2), without setting these."""
         seconds = 0.0
         for positions, controls in zip(mocap, control, strict=True):
             for (_, data), position, values in zip(self.pairs, positions, controls, strict=True):
@@ -50,7 +50,7 @@ class _Physics:
 
 
 def steps(settings: Settings) -> list[Row]:
-    """All 50 tasks, expert actions, one thread, in turns of 25 steps; all must come to the same states."""
+    """Step all 50 tasks with expert actions in one thread, in turns of 25 steps; check that all states are equal."""
     tasks = lw.MT50[:3] if settings.quick else lw.MT50
     n, seeds = len(tasks), list(range(len(tasks)))
     experts = [ENV_POLICY_MAP[f"{task}-v3"]() for task in tasks]

@@ -1,11 +1,11 @@
-"""Statistics over training seeds × tasks: means with their intervals, comparisons, counts of tasks, and summaries.
+"""Statistics over training seeds and tasks: means with confidence intervals, comparisons, and summaries.
 
-Every function takes success rates in [0, 1] as an array (seeds, tasks), and the confidence of its interval, in (0, 1).
-Two methods have the same tasks in the same order; their seeds are not paired, and may differ in number. Intervals are
-Student's t over the seeds; the tasks stay the same (only :func:`mean_over_tasks` also draws tasks). The standard error
-is the jackknife's over seeds, for a mean the usual one. Two methods' errors add as in Welch's test. A few seeds give
-wide intervals: with three, t is 4.3 standard errors. In simulation (20 tasks, 20 episodes) the 95 % interval holds the
-true mean in 0.95 of the cases for 3, 5 and 20 seeds.
+The functions accept success rates in [0, 1] as an array (seeds, tasks), and the confidence of the interval, in (0, 1).
+Two methods have the same tasks in the same order. Their seeds are not paired, and may differ in number. Intervals are
+Student's t intervals over seeds, for fixed tasks (only :func:`mean_over_tasks` also resamples tasks). The standard
+error is the jackknife's over seeds, which for a mean is the usual one. The errors of two methods are combined as in
+Welch's test. Few seeds give wide intervals: with three seeds, t is 4.3 standard errors. In simulations (20 tasks, 20
+episodes), the 95 % interval contains the true mean in 95 % of the cases, for 3, 5 and 20 seeds.
 
 Source: Agarwal et al. 2021, 'Deep Reinforcement Learning at the Edge of the Statistical Precipice', for the statistics;
 Tukey 1958 for the jackknife with Student's t.
@@ -25,12 +25,12 @@ from lw_torchrl._util.checks import counted, typed
 from lw_torchrl.evaluation import EvaluationResult
 
 Array = NDArray[np.float64]
-_SETTINGS = ("episodes_per_task", "noise_scale", "max_steps")  # rates are averaged only if these are equal
+_SETTINGS = ("episodes_per_task", "noise_scale", "max_steps")  # rates with different values are not averaged
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """An estimate and its interval; the ends are None for a single seed, which gives no interval.
+    """An estimate with its confidence interval, whose ends are None if there is only one seed.
 
     Example:
         >>> print(Estimate(0.5, 0.41, 0.6))
@@ -50,7 +50,7 @@ class Estimate:
 
 
 def check_rates(argument: str, given: Any) -> Array:
-    """Return ``given`` as a float64 array (seeds, tasks) of rates in [0, 1]; refuse NaN."""
+    """Return ``given`` as a float64 array (seeds, tasks); raise a ValueError unless all rates are in [0, 1]."""
     try:
         rates = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -73,7 +73,7 @@ def mean_rate(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
 
 
 def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
-    """Return the mean of the middle half of all ``rates`` (seeds, tasks), in [0, 1]: a quarter is cut at each end.
+    """Return the mean of the middle half of all ``rates`` (seeds, tasks) in [0, 1], without a quarter at each end.
 
     Example:
         >>> print(interquartile_mean([[1.0, 0.2, 0.6, 0.7], [0.9, 0.3, 0.5, 0.9], [1.0, 0.1, 0.4, 0.8]]))
@@ -90,7 +90,7 @@ def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimat
 
 
 def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
-    """Return the mean over tasks of method X's rate minus Y's on the same task.
+    """Return the mean over tasks of the difference between method X's rate and method Y's.
 
     ``x`` and ``y`` are (seeds, tasks), in [0, 1].
 
@@ -102,11 +102,11 @@ def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> 
 
 
 def mean_over_tasks(values: ArrayLike, *, confidence: float = 0.95, draws: int = 10_000) -> Estimate:
-    """Return the mean of ``values`` (seeds, tasks) with an interval that holds for other seeds and other tasks.
+    """Return the mean of ``values`` (seeds, tasks) with an interval that also covers other seeds and other tasks.
 
-    ``values`` are rates, or differences of two rates of the same seed and task: pairs of evaluations of one policy. The
-    hierarchical bootstrap draws seeds and tasks with replacement, one less than there are of each, so that few of them
-    do not make the interval too narrow (Rao & Wu 1988). A single seed counts as the only one.
+    ``values`` are rates, or differences between two rates of the same policy on the same task. A hierarchical bootstrap
+    draws seeds and tasks with replacement. It draws one fewer than there are of each, because otherwise the interval
+    would be too narrow for few seeds or tasks (Rao & Wu 1988). With a single seed, only tasks are drawn.
 
     Example:
         >>> estimate = mean_over_tasks([[0.2, 0.0, 0.4, 0.1], [0.3, 0.0, 0.5, 0.0]])
@@ -122,7 +122,7 @@ def mean_over_tasks(values: ArrayLike, *, confidence: float = 0.95, draws: int =
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
-    """Return the probability that a seed of method X beats one of Y on a random task; a tie counts half.
+    """Return the probability that a random seed of method X beats one of Y on a random task; a tie counts half.
 
     ``x`` and ``y`` are (seeds, tasks), in [0, 1].
 
@@ -160,15 +160,15 @@ def _pair(x: ArrayLike, y: ArrayLike) -> list[Array]:
 def _seed_interval(
     statistic: Callable[..., Any], methods: list[Array], confidence: float, *, least: float, most: float = 1.0
 ) -> Estimate:
-    """Return the statistic of the methods' rates and its interval, within the range of the statistic."""
+    """Return the statistic of the methods' rates with its interval, clipped to the range of the statistic."""
     from scipy.special import stdtrit
 
     if not 0 < confidence < 1:
         raise ValueError(f"confidence must be in (0, 1), got {confidence!r}")
     value = float(statistic(*methods))
     if min(len(rates) for rates in methods) == 1:
-        return Estimate(value)  # one seed says nothing about others
-    variances = np.zeros(len(methods))  # over the seeds of each method: each is left out once
+        return Estimate(value)  # the variance over seeds is unknown
+    variances = np.zeros(len(methods))  # of each method, by leaving out one seed at a time
     for k, rates in enumerate(methods):
         without = [np.delete(rates, seed, axis=0) for seed in range(len(rates))]
         left = [statistic(*methods[:k], others, *methods[k + 1 :]) for others in without]
@@ -195,11 +195,11 @@ class Summary:
     """The success rates of one method over seeds and tasks, from :func:`summarize` or :func:`summarize_rates`.
 
     Attributes:
-        tasks, seeds: their names, T and n of them.
-        rates: n rows of T success rates at any step.
-        mean, iqm: the mean and the interquartile mean over seeds and tasks, with 95 % intervals over the seeds.
+        tasks, seeds: the names of the T tasks and n seeds.
+        rates: n rows of T rates of success at any step.
+        mean, iqm: the mean and the interquartile mean over seeds and tasks, with 95 % intervals over seeds.
         solved: the number of tasks whose mean over seeds is at least ``threshold``.
-        threshold: 0.8.
+        threshold: the minimum mean rate of a solved task (default: 0.8).
     """
 
     tasks: tuple[str, ...]
@@ -212,19 +212,19 @@ class Summary:
 
     @property
     def array(self) -> Array:
-        """The rates as a fresh float64 array (n, T), for the functions of this module."""
+        """The rates as a new float64 array (n, T), for the functions of this module."""
         return np.array(self.rates)
 
     @cached_property
     def per_task(self) -> dict[str, TaskSummary]:
-        """Task to its mean, minimum and maximum over the seeds."""
+        """The mean, minimum and maximum over the seeds of each task."""
         rates = self.array
         columns = zip(rates.mean(0).tolist(), rates.min(0).tolist(), rates.max(0).tolist(), strict=True)
         return {task: TaskSummary(*column) for task, column in zip(self.tasks, columns, strict=True)}
 
     @property
     def by_seed(self) -> dict[str, float]:
-        """Seed to its mean over the tasks."""
+        """The mean over the tasks of each seed."""
         return dict(zip(self.seeds, self.array.mean(1).tolist(), strict=True))
 
     def to_json(self) -> dict[str, Any]:
@@ -264,10 +264,10 @@ def summarize_rates(
     """Summarize success rates that do not come from one evaluation per seed.
 
     Args:
-        rates: task to its n success rates, one per training seed, in [0, 1].
+        rates: for each task, n success rates in [0, 1], one per training seed.
         seeds: the seeds' names; by default 0 to n - 1.
-        threshold: the smallest mean rate of a solved task.
-        confidence: of the intervals, in (0, 1).
+        threshold: the minimum mean rate of a solved task.
+        confidence: the confidence of the intervals, in (0, 1).
 
     Example:
         >>> summary = summarize_rates({"push": [0.5, 0.7], "reach": [1.0, 0.9]})
@@ -298,14 +298,14 @@ def summarize_rates(
 
 @typed
 def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResult], **options: Any) -> Summary:
-    """Summarize the any-step success of several training seeds, one evaluation of the same tasks each.
+    """Summarize success at any step over several training seeds, each evaluated once on the same tasks.
 
     Args:
-        results: training seed to result, or the results in order.
+        results: a mapping from training seed to result, or the results in order.
         options: ``threshold`` (0.8) and ``confidence`` (0.95), as for :func:`summarize_rates`.
 
     Raises:
-        ValueError: no results, one evaluation given twice, or evaluations that differ in tasks, plans,
+        ValueError: ``results`` is empty, an evaluation is repeated, or evaluations differ in tasks, plans,
             episodes_per_task, noise_scale or max_steps.
 
     Example:
@@ -320,15 +320,15 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
         raise ValueError("results must hold at least one result, got none")
     for number, (seed, result) in enumerate(named.items()):
         if (twice := next((k for k, one in list(named.items())[:number] if one == result), None)) is not None:
-            raise ValueError(f"results must be of different training seeds, {twice!r} and {seed!r} are one evaluation")
+            raise ValueError(f"results must have different training seeds; {twice!r} and {seed!r} are one evaluation")
     first_seed, first = next(iter(named.items()))
     tasks = tuple(first.success_once)
     for seed, result in named.items():
         both = f"seeds {first_seed!r} and {seed!r}"
         if different := ", ".join(sorted(set(tasks) ^ set(result.success_once))):
-            raise ValueError(f"results must be of the same tasks; {both} do not share {different}")
+            raise ValueError(f"results must have the same tasks; {both} do not share {different}")
         if len({one.origin.get("plans") for one in (first, result)} - {None}) > 1:
-            raise ValueError(f"results must be of the same plans; those of {both} differ")
+            raise ValueError(f"results must have the same plans; those of {both} differ")
         for key in _SETTINGS:
             if (was := first.config.get(key)) != (now := result.config.get(key)):
                 got = f"{was!r} for seed {first_seed!r} and {now!r} for seed {seed!r}"

@@ -1,4 +1,4 @@
-"""A step of behavioral cloning, eager on each device that there is, and compiled."""
+"""Benchmarks of a behavioral cloning step, on each available device and with torch.compile."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _batch() -> TensorDict:
 
 
 class _Learner:
-    """An actor, its loss and its optimizer, as BehavioralCloningTrainer has them."""
+    """An actor with the loss and optimizer of BehavioralCloningTrainer."""
 
     def __init__(self, batch: TensorDict, *, compiled: bool = False, device: str = "cpu") -> None:
         torch.manual_seed(0)
@@ -46,13 +46,13 @@ class _Learner:
 
 
 def _devices() -> dict[str, str]:
-    """Each device that there is, and what to call it."""
+    """Return the name to print for each available device."""
     gpus = {f"cuda:{number}": torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())}
     return {"cpu": "CPU", **gpus, **({"mps": "MPS"} if torch.backends.mps.is_available() else {})}
 
 
 def _on(batch: TensorDict, device: str, steps: int) -> float:
-    """Seconds of a step: the mean, since a GPU is waited for at the end alone."""
+    """Return the mean seconds of a step, with a single synchronization at the end."""
     step = _Learner(batch, device=device)
     for _ in range(3):
         step()
@@ -66,7 +66,7 @@ def _on(batch: TensorDict, device: str, steps: int) -> float:
 
 
 def train_step(settings: Settings) -> list[Row]:
-    """PlanConditionedActor with BCLoss on batches of 500 of all 50 tasks."""
+    """Train PlanConditionedActor with BCLoss on batches of 500 rows of all 50 tasks."""
     batch = _batch()
     name = f"training step, batch {BATCH}"
     steps = settings.pick(100, 2)

@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CLOSE = 0.05
-"""Loss of success up to which an evaluator is useful."""
+"""Maximum loss of success with which an evaluator still counts as useful."""
 
 
 class Cell(NamedTuple):
-    """How conditions are answered."""
+    """A way to answer conditions: exactly, every few steps, or with errors."""
 
     kind: str
-    """"every": steps between answers; "flip": probability that an answer is wrong."""
+    """"every" (steps between answers) or "flip" (probability that an answer is wrong)."""
     value: float
 
     @property
@@ -45,7 +45,7 @@ class Cell(NamedTuple):
         return f"every {self.value:g} steps" if self.kind == "every" else f"{100 * self.value:g}% flipped"
 
     def evaluator(self, plans: lw.Plans, seed: int) -> Any:
-        """What answers in the query answering function's place; None for itself."""
+        """Return the transform that corrupts the answers; None for exact answers."""
         if self.exact:
             return None
         if self.kind == "every":
@@ -56,11 +56,12 @@ class Cell(NamedTuple):
 @dataclass(frozen=True)
 class Arguments:
     """Evaluate policies with rare or wrong answers to conditions, all in the same episodes with the same noise.
+
     If the command is stopped, run it again to resume.
     """
 
     policy: tuple[Path, ...] = ()
-    """Files of policies; policies of one kind, such as several training seeds, make one curve."""
+    """Policy files; policies of the same kind, such as several training seeds, are drawn as one curve."""
     scripted: bool = True
     """Also evaluate scripted skills."""
     plans: str = "MT50"
@@ -74,25 +75,25 @@ class Arguments:
     episodes: int = 20
     """Number of episodes per task and seed."""
     seeds: tuple[int, ...] = (2000,)
-    """Random seed of the episodes (not one that demonstrations used)."""
+    """Random seed of the episodes (use a different one than for demonstrations)."""
     max_steps: int = 500
-    """Steps of an episode."""
+    """Number of steps per episode."""
     noise: float = 0.1
     """Standard deviation of the action noise."""
     quick: bool = False
-    """Run two tasks, two short episodes and two points to see that it works; the numbers mean nothing."""
+    """Run two tasks, two short episodes and two points as a test; the numbers are meaningless."""
     out: Path = Path("runs/truth")
     """Folder for the results, table.md and truth.png."""
 
     @property
     def cells(self) -> list[Cell]:
-        """All that is done, exact answers first and once."""
+        """Return all ways to answer conditions, with exact answers first."""
         found = [Cell("every", k) for k in self.every] + [Cell("flip", p) for p in self.flip]
         return sorted({cell.name: cell for cell in found}.values(), key=lambda cell: not cell.exact)
 
 
 class Acting(NamedTuple):
-    """Who acts: the curve it belongs to, a name of its own, and the actor."""
+    """An actor to evaluate, with the name of its curve and a unique name."""
 
     curve: str
     name: str
@@ -100,12 +101,12 @@ class Acting(NamedTuple):
 
 
 def acting(args: Arguments) -> list[Acting]:
-    """Policies by their files, and scripted skills."""
+    """Return the policies from their files, and scripted skills."""
     found = []
     for file in args.policy:
         actor = lw.load_actor(file)
         if "qaf" not in actor.in_keys:
-            raise SystemExit(f"--policy: {file} does not read qaf, so it feels no answers: {actor.in_keys}")
+            raise SystemExit(f"--policy: {file} must read qaf to depend on answers, but reads {actor.in_keys}")
         name = f"{file.stem}-{sha256(file.read_bytes()).hexdigest()[:8]}"
         found.append(Acting(type(actor).__name__, name, actor))
     if args.scripted:
@@ -117,7 +118,7 @@ def acting(args: Arguments) -> list[Acting]:
 
 
 def run_unit(one: Acting, cell: Cell, seed: int, args: Arguments) -> EvaluationResult:
-    """One actor under one kind of answers, read if it was done before."""
+    """Evaluate an actor with one way to answer conditions, or read the result if it exists."""
     folder = f"seed-{seed}-{args.episodes}-episodes-{args.max_steps}-steps-noise-{args.noise:g}"
     file = args.out / folder / f"{one.name}, {cell.name}.json"
     tasks = [task for task in args.tasks if task in one.actor.tasks]
@@ -140,7 +141,7 @@ def run_unit(one: Acting, cell: Cell, seed: int, args: Arguments) -> EvaluationR
 
 
 class Found:
-    """The results of each curve and cell, which are of the same tasks."""
+    """The results of each curve and cell, all on the same tasks."""
 
     def __init__(self) -> None:
         self._by: dict[str, dict[str, list[EvaluationResult]]] = {}
@@ -153,7 +154,7 @@ class Found:
         return list(self._by)
 
     def hits(self, curve: str, cell: Cell) -> np.ndarray | None:
-        """(episodes, tasks) of 0 and 1, of all policies and seeds; None where nothing was done yet."""
+        """Return the success (episodes, tasks) as 0 or 1 for all policies and seeds, or None without results."""
         results = self._by[curve].get(cell.name)
         return None if results is None else np.concatenate([_hits(result) for result in results])
 
@@ -167,13 +168,16 @@ def _hits(result: EvaluationResult) -> np.ndarray:
 
 
 def _rate(hits: np.ndarray) -> Estimate:
-    """The mean of the tasks, which have as many episodes each, with Wilson's interval of all episodes: a little wide,
-    since tasks differ, and no mere point where all succeed. It is of these policies, not of others trained alike."""
+    """Return the mean over tasks with the Wilson interval over all episodes.
+
+    The interval is slightly too wide, because tasks differ, but has a positive width even if all episodes succeed. It
+    applies to these policies only, not to others trained in the same way.
+    """
     return Estimate(float(hits.mean()), *wilson_interval(int(hits.sum()), hits.size))
 
 
 def table(found: Found, cells: Sequence[Cell]) -> str:
-    """Means with intervals, what that asks of an evaluator, and each task's rates."""
+    """Return tables of mean success with intervals and of each task, and the accuracy that an evaluator needs."""
     head, rows = ["answers", *found.curves, *(f"tasks >= 0.8, {curve}" for curve in found.curves)], []
     for cell in cells:
         hits = [found.hits(curve, cell) for curve in found.curves]
@@ -194,10 +198,10 @@ def table(found: Found, cells: Sequence[Cell]) -> str:
 
 
 def within(found: Found, curve: str, cells: Sequence[Cell]) -> str:
-    """How seldom and how wrong the answers may be for little to be lost, in words."""
+    """Return a sentence on how rare and how wrong answers may be without much loss of success."""
     exact = next((found.hits(curve, cell) for cell in cells if cell.exact), None)
     if exact is None:
-        return "exact answers were not asked for"
+        return "exact answers were not evaluated"
     least = exact.mean() - CLOSE
     told = []
     for kind, words in (("every", "answers every {:g} steps"), ("flip", "{:g}% flipped")):
@@ -207,7 +211,7 @@ def within(found: Found, curve: str, cells: Sequence[Cell]) -> str:
             if hits is None or hits.mean() < least - 1e-9:
                 break
             far = cell.value if cell.kind == kind and not cell.exact else far
-        told.append("exact ones alone" if far is None else words.format(100 * far if kind == "flip" else far))
+        told.append("only exact answers" if far is None else words.format(100 * far if kind == "flip" else far))
     return f"within {CLOSE:g} of exact answers up to {told[0]}; up to {told[1]}"
 
 
@@ -238,7 +242,7 @@ def main(args: Arguments) -> None:
         )  # fmt: skip
     everyone, found = acting(args), Found()
     if not everyone:
-        raise SystemExit("nobody acts: give --policy FILE, or leave out --no-scripted")
+        raise SystemExit("there is no policy to evaluate: add --policy FILE, or remove --no-scripted")
     total, done = len(args.cells) * len(everyone) * len(args.seeds), 0
     for cell in args.cells:
         for one in everyone:

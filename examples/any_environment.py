@@ -1,4 +1,4 @@
-"""Train on somebody else's environment, gymnasium's FetchReach, by TorchRL alone: TD3 on our actor and critic."""
+"""Train our actor and critic with TorchRL's TD3 on an environment from another library, gymnasium's FetchReach."""
 
 import argparse
 
@@ -22,7 +22,7 @@ PLANS = lw.canonical_plans(lw.Plans([load_plans()["fetch/reach"]]))
 
 
 def observe(state: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
-    """Fetch's numbers in our frame: x to the right, y away from the robot. Those of a thing, which it lacks, are 0."""
+    """Convert Fetch's observation to our axes (x right, y away from the robot); values of the absent object are 0."""
     seen = state.new_zeros(*state.shape[:-1], 25)
     for at, place in ((0, state[..., :3]), (22, goal)):
         seen[..., at : at + 3] = torch.stack((0.75 - place[..., 1], place[..., 0] - 0.745, place[..., 2] - 0.377), -1)
@@ -34,7 +34,7 @@ def act(action: torch.Tensor) -> torch.Tensor:
 
 
 def features() -> Concat:
-    """Differences of positions, and the target's position relative to what the active step moves."""
+    """Create features: differences of positions, and the target relative to the object that the active step moves."""
     return Concat(ObservationFeatures(layout=PLANS.layout), RoleFeatures(PLANS))
 
 
@@ -69,7 +69,7 @@ def main() -> None:
             optimizer.step()
             targets.step()
         if number % 10 == 9:
-            print(f"{(number + 1) * 50} steps, the last episode's reward {episode['next', 'reward'].sum():.2f}")
+            print(f"{(number + 1) * 50} steps, return of the last episode {episode['next', 'reward'].sum():.2f}")
     collector.shutdown()
 
 

@@ -1,7 +1,7 @@
-"""Co-learning on your own data: your demonstration of a target 1:1 beside demonstrations of base tasks.
+"""Co-learning on your own data: half of each minibatch is your demonstration of a target task, half base tasks.
 
-python examples/co_learning.py            # window-open beside two base tasks, about two minutes
-python examples/co_learning.py --steps 20 # only to see it run
+python examples/co_learning.py            # window-open with two base tasks, about two minutes
+python examples/co_learning.py --steps 20 # a quick test
 """
 
 import argparse
@@ -20,7 +20,7 @@ BASE, TARGET = ["drawer-open", "door-open"], "window-open"
 
 
 def my_demonstration() -> TensorDict:
-    """Your own rows go here: what was seen and what was done, (T, 39) and (T, 4), from a robot, a person, a file."""
+    """Return one demonstration; replace this by your own observations (T, 39) and actions (T, 4), or a file of them."""
     env = lw.LanguageWorldEnv(TARGET, seed=7)
     rollout = env.rollout(100, lw.ExpertActor(TARGET))[0]
     env.close()
@@ -37,7 +37,7 @@ def my_demonstration() -> TensorDict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--demonstrations", type=int, default=5, help="of each base task")
+    parser.add_argument("--demonstrations", type=int, default=5, help="number of demonstrations per base task")
     parser.add_argument("--episodes", type=int, default=5)
     args = parser.parse_args()
     torch.manual_seed(0)
@@ -55,7 +55,7 @@ def main() -> None:
         )
         actor = lw.PlanConditionedActor(plans)
         fit_normalization(actor, replay)
-        warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss about itself
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss's own, irrelevant warning
         loss = BCLoss(actor, loss_function="l2")
         optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3)
         for step in range(args.steps):
@@ -65,7 +65,7 @@ def main() -> None:
             value.backward()
             optimizer.step()
             if step % 100 == 0:
-                print(f"step {step:5}  loss {value.item():.4f}  the target's rows {int(batch['is_target'].sum())}")
+                print(f"step {step:5}  loss {value.item():.4f}  rows of the target {int(batch['is_target'].sum())}")
 
     print(lw.evaluate(actor, tasks=[TARGET, *BASE], episodes_per_task=args.episodes, seed=1_000).table())
 

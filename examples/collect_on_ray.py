@@ -1,4 +1,4 @@
-"""Experience from several machines: TorchRL's RayCollector, whose workers run episodes of their own.
+"""Collect experience on several machines with TorchRL's RayCollector; each worker runs different episodes.
 
 pip install 'lw_torchrl[ray]'
 python examples/collect_on_ray.py --workers 2 --batches 4
@@ -38,13 +38,13 @@ def main() -> None:
         collector_kwargs={"auto_register_policy_transforms": False},
         remote_configs={"num_cpus": 1, "num_gpus": 0, "memory": 2**30},
     )
-    collector.update_policy_weights_()  # the first weights
+    collector.update_policy_weights_()  # send the initial weights to the workers
     for number, batch in enumerate(collector):
         episodes = batch["episode"].unique().tolist()
         print(
             f"batch {number}: {batch.numel()} steps, episodes {episodes}, reward {batch['next', 'reward'].mean():.3f}"
         )
-        with torch.no_grad():  # train here; the workers get the new weights
+        with torch.no_grad():  # train here, then send the new weights to the workers
             collector.update_policy_weights_()
     collector.shutdown()
     ray.shutdown()

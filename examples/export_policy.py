@@ -1,7 +1,7 @@
-"""A policy for a robot without Python's help: queries and actor as one exported program, for any number of rows.
+"""Export a policy to run it without Python: condition checks and actor become one program for any batch size.
 
 python examples/export_policy.py policy.safetensors policy.pt2
-python examples/export_policy.py policy.safetensors policy.pt2 --aot   # compiled ahead of time, half a minute
+python examples/export_policy.py policy.safetensors policy.pt2 --aot   # compile ahead of time, in half a minute
 """
 
 import argparse
@@ -16,7 +16,7 @@ from lw_torchrl.modules import transform_of
 
 
 class Deployed(nn.Module):
-    """observation (B, 39) float32 and task_id (B,) int64 to the action (B, 4) float32."""
+    """A module that maps observation (B, 39) float32 and task_id (B,) int64 to the action (B, 4) float32."""
 
     def __init__(self, actor: TensorDictModuleBase) -> None:
         super().__init__()
@@ -29,9 +29,9 @@ class Deployed(nn.Module):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("policy", help="a file that lw-torchrl train wrote")
-    parser.add_argument("program", help="where the program goes, .pt2")
-    parser.add_argument("--aot", action="store_true", help="compile it with AOTInductor, which C++ can load")
+    parser.add_argument("policy", help="policy file, written by lw-torchrl train")
+    parser.add_argument("program", help="file to write the program to, .pt2")
+    parser.add_argument("--aot", action="store_true", help="compile the program with AOTInductor, for use in C++")
     args = parser.parse_args()
 
     actor = lw.load_actor(args.policy)
@@ -50,7 +50,7 @@ def main() -> None:
         for number in (1, 7, 64):
             state = torch.rand(number, 39), torch.full((number,), task)
             away = (run(*state) - module(*state)).abs().max().item()
-            print(f"{number:3} rows: at most {away:.1e} away from the policy in Python")
+            print(f"{number:3} rows: actions differ by at most {away:.1e} from the policy in Python")
     print(f"{args.program}: {', '.join(actor.tasks)}")
 
 

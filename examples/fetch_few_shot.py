@@ -1,7 +1,8 @@
-"""Fetch learns to reach, push, and pick and place from ten demonstrations of each: python examples/fetch_few_shot.py
+"""Train a Fetch robot to reach, push, and pick and place: python examples/fetch_few_shot.py
 
-Plans carried out by scripts demonstrate, with noise on what they do. The policy sees where the things are that the
-active step is about, and how far the gripper is open. With few demonstrations, more would lead it astray.
+Scripted skills that follow plans provide ten noisy demonstrations of each task. The policy observes only the relative
+positions of the objects of the active plan step, and the gripper's opening: with so few demonstrations, a policy with
+more features would overfit.
 """
 
 import argparse
@@ -16,10 +17,12 @@ from lw_torchrl.suites import load_suite
 TASKS = ["fetch/reach", "fetch/push", "fetch/pick-and-place"]
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of demonstrations, weights and minibatches")
-parser.add_argument("--demonstrations", type=int, default=10, help="of each task")
-parser.add_argument("--steps", type=int, default=3000, help="minibatches of 300")
-parser.add_argument("--episodes", type=int, default=50, help="evaluated of each task, on seed 1000 and with noise 0.1")
+parser.add_argument(
+    "--seeds", type=int, nargs="+", default=[0], help="random seeds of demonstrations, weights and minibatches"
+)
+parser.add_argument("--demonstrations", type=int, default=10, help="number of demonstrations per task")
+parser.add_argument("--steps", type=int, default=3000, help="number of minibatches, of 300 rows each")
+parser.add_argument("--episodes", type=int, default=50, help="evaluation episodes per task (seed 1000, noise 0.1)")
 parser.add_argument("--out", type=Path, default=Path("runs/fetch-few-shot"))
 options = parser.parse_args()
 

@@ -1,7 +1,7 @@
-"""Offline RL on a plan: from scripts that do the wrong thing most of the time, against cloning their successes.
+"""Compare offline RL with cloning the successful episodes, on data from policies that are wrong most of the time.
 
 python examples/offline_rl.py             # drawer-open and push, about five minutes
-python examples/offline_rl.py --steps 20 --episodes 1 --data 6  # only to see it run
+python examples/offline_rl.py --steps 20 --episodes 1 --data 6  # a quick test
 """
 
 import argparse
@@ -18,7 +18,7 @@ TASKS, GAMMA = ["drawer-open", "push"], 0.99
 
 
 def collect(root: str, episodes: int) -> list[str]:
-    """Plans whose every piece of 8 to 24 steps is right with probability 0.3, or never: a folder for each."""
+    """Collect two datasets: their segments of 8 to 24 steps follow the plan with probability 0.3, or never."""
     for policy in ("noisy-30", "wrong"):
         lw.collect_demonstrations(
             TASKS, episodes_per_task=episodes, root=f"{root}/{policy}", policy=policy, noise_scale=0.3, noise_hold=10
@@ -27,7 +27,7 @@ def collect(root: str, episodes: int) -> list[str]:
 
 
 def show(roots: list[str], plans: lw.Plans, **options) -> lw.LanguageWorldExperienceReplay:
-    """Rows of both, equally many of each task, with episodes that end at their first success."""
+    """Open both datasets as one buffer that samples tasks equally; episodes end at their first success."""
     return lw.LanguageWorldExperienceReplay(
         roots,
         label="executed",
@@ -40,9 +40,9 @@ def show(roots: list[str], plans: lw.Plans, **options) -> lw.LanguageWorldExperi
 
 
 def train(loss, replay, steps: int, learning_rate: float) -> None:
-    """A loss over a buffer; ``lw.OfflineTrainer`` is this with checkpoints."""
+    """Minimize a loss on a buffer; ``lw.OfflineTrainer`` does the same and also writes checkpoints."""
     targets = SoftUpdate(loss, eps=0.995) if "target_value_network_params" in dict(loss.named_children()) else None
-    fit_normalization(loss, replay)  # reaches target networks, too
+    fit_normalization(loss, replay)  # also sets the statistics of target networks
     optimizer = torch.optim.AdamW([p for p in loss.parameters() if p.requires_grad], lr=learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for step in range(steps):
@@ -60,36 +60,36 @@ def train(loss, replay, steps: int, learning_rate: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=int, default=20, help="episodes of each task and behaviour")
+    parser.add_argument("--data", type=int, default=20, help="number of episodes per task and dataset")
     parser.add_argument("--steps", type=int, default=3000)
-    parser.add_argument("--episodes", type=int, default=20, help="evaluated for each task")
+    parser.add_argument("--episodes", type=int, default=20, help="number of evaluation episodes per task")
     args = parser.parse_args()
     torch.manual_seed(0)
     plans = lw.load_plans("MT10")
-    warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss about itself
+    warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss's own, irrelevant warning
 
     with tempfile.TemporaryDirectory() as root:
         roots = collect(root, args.data)
 
-        print("the value of states, ten steps ahead")
+        print("training the state value, with 10-step returns")
         rows = show(roots, plans, reward="dense_cost", n_steps=10, gamma=GAMMA)
         value = lw.objectives.ExpectileValueLoss(lw.PlanConditionedValue(plans, ensemble=2), expectile=0.7)
         value.make_value_estimator(gamma=GAMMA)
         train(value, rows, args.steps, 5e-4)
         advantage = torch.cat([value.advantage(rows[i : i + 10_000]) for i in range(0, len(rows), 10_000)])
 
-        print("a policy, by advantage")
+        print("training a policy on advantage-weighted rows")
         weighted = show(roots, plans, reward="dense_cost")
         weighted.add_column("advantage", lw.objectives.standardize_by_task(advantage, weighted[:]["task_id"]), of=rows)
         ours = lw.PlanConditionedActor(plans)
         train(lw.objectives.AdvantageWeightedLoss(ours, beta=2.0), weighted, args.steps, 1e-3)
 
-        print("a policy, by the episodes that succeeded")
+        print("training a policy on successful episodes")
         successes = show(roots, plans, keep=lw.data.EpisodeFilter(success=True))
         cloned = lw.PlanConditionedActor(plans)
         train(BCLoss(cloned, loss_function="l2"), successes, args.steps, 1e-3)
 
-    for name, actor in {"by advantage": ours, "successes cloned": cloned}.items():
+    for name, actor in {"advantage-weighted": ours, "successes cloned": cloned}.items():
         found = lw.evaluate(actor, tasks=TASKS, episodes_per_task=args.episodes, seed=1_000, stop_at_success=True)
         print(f"{name}: {found.success_once}")
 

@@ -1,6 +1,6 @@
-"""Train a policy with plain PyTorch on an exported dataset: LeRobot's parquet files, a network and a loop.
+"""Train a policy with plain PyTorch on a dataset that was exported to LeRobot's parquet files.
 
-python examples/plain_pytorch.py  # drawer-open, reach and window-open, under a minute; --steps 50 to see it run
+python examples/plain_pytorch.py  # drawer-open, reach and window-open, under a minute; --steps 50 for a quick test
 """
 
 import argparse
@@ -19,7 +19,7 @@ TASKS = ["drawer-open", "reach", "window-open"]
 
 
 class Network(nn.Module):
-    """An action from an observation and the number of its task."""
+    """A network that maps an observation and a task id to an action."""
 
     def __init__(self, observation: torch.Tensor) -> None:
         super().__init__()
@@ -35,7 +35,7 @@ class Network(nn.Module):
 
 
 def exported_rows(root: str, demonstrations: int) -> TensorDataset:
-    """Observations, tasks and the experts' actions, up to 20 steps after each episode's first success."""
+    """Return observations, task ids and expert actions, up to 20 steps after the first success of each episode."""
     how = {"noise_scale": [0.0, 0.1, 0.2], "redraw_failures": True}
     lw.collect_demonstrations(TASKS, episodes_per_task=demonstrations, root=f"{root}/demos", **how)
     out = lw.export_dataset(f"{root}/demos", "lerobot", f"{root}/out")

@@ -1,7 +1,7 @@
-"""PPO with TorchRL's own loss, from a cloned policy: an actor and a value on one shared trunk.
+"""Improve a cloned policy with TorchRL's PPO loss; actor and value network share a trunk.
 
 python examples/ppo.py               # window-open, two demonstrations, 30 updates: about five minutes
-python examples/ppo.py --updates 2   # only to see it run
+python examples/ppo.py --updates 2   # a quick test
 """
 
 import argparse
@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=30)
     parser.add_argument("--rows", type=int, default=16)
     parser.add_argument("--horizon", type=int, default=200)
-    parser.add_argument("--clone", type=int, default=200, help="steps of behavioral cloning before")
+    parser.add_argument("--clone", type=int, default=200, help="steps of behavioral cloning before PPO")
     args = parser.parse_args()
     torch.manual_seed(0)
     plans = lw.load_plans("MT10")

@@ -1,9 +1,9 @@
-"""A training to watch while it runs: curves in groups, what the policy does, and whole rollouts, in one recording.
+"""Record a training run with Rerun: grouped loss curves, the policy's skills and actions, and whole rollouts.
 
 python examples/rerun_training.py                          # drawer-open and window-open, about two minutes
-python examples/rerun_training.py --connect 127.0.0.1:9876 # the same, live in a viewer: start it with `rerun`
-python examples/rerun_training.py --steps 20               # only to see it run
-lw-torchrl view runs/rerun_training                        # look at it, now or while it trains
+python examples/rerun_training.py --connect 127.0.0.1:9876 # the same, live in a viewer that you start with `rerun`
+python examples/rerun_training.py --steps 20               # a quick test
+lw-torchrl view runs/rerun_training                        # show the recording, during or after training
 """
 
 import argparse
@@ -24,7 +24,7 @@ SEED = 1_000
 
 
 def show(logger, env, actor, plans, step, length) -> None:
-    """One rollout of each task: how many succeeded, what was done, and the episodes to look at."""
+    """Run and log one rollout of each task: success, the share of each skill, actions, and the episodes themselves."""
     with torch.no_grad():
         rollout = env.rollout(length, actor.eval())
     actor.train()
@@ -42,10 +42,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--demonstrations", type=int, default=5)
-    parser.add_argument("--rollouts", type=int, default=4, help="how often the policy is shown")
-    parser.add_argument("--length", type=int, default=150, help="steps of a rollout")
+    parser.add_argument("--rollouts", type=int, default=4, help="number of times to record rollouts")
+    parser.add_argument("--length", type=int, default=150, help="number of steps per rollout")
     parser.add_argument("--out", default="runs/rerun_training/training.rrd")
-    parser.add_argument("--connect", help="the address of a viewer that is open")
+    parser.add_argument("--connect", help="address of a running viewer")
     args = parser.parse_args()
     torch.manual_seed(0)
     plans = lw.load_plans("MT10")
@@ -67,7 +67,7 @@ def main() -> None:
         )
         actor = lw.PlanConditionedActor(plans)
         fit_normalization(actor, replay)
-        warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss about itself
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss's own, irrelevant warning
         loss = BCLoss(actor, loss_function="l2")
         optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, args.steps)

@@ -1,10 +1,10 @@
-"""Your own suite: robosuite's Lift, Stack and Door with any arm and a Panda's gripper, and Meta-World's policies in it.
-python examples/suite_robosuite.py check --arms Panda Sawyer                 # measure what the suite says of itself
+"""A custom suite: run Meta-World policies on robosuite's Lift, Stack and Door, with any arm and a Panda gripper.
+python examples/suite_robosuite.py check --arms Panda Sawyer                 # compare the simulator with the layout
 python examples/suite_robosuite.py expert --arms Panda --task stack --seed 7 # scripted skills
 python examples/suite_robosuite.py POLICY --arms Panda Sawyer --task lift --episodes 50 --seed 3000
 
-POLICY is a file that `python -m benchmarks.paper zero-shot --methods pcbc` wrote; it was not trained on robosuite.
-Its words are in robosuite_words/. pip install 'lw_torchrl[robosuite]'; beside mujoco 3.3 Sawyer needs robosuite 1.5.2.
+POLICY is a file from `python -m benchmarks.paper zero-shot --methods pcbc`, trained on Meta-World only. Tasks and plans
+are in robosuite_words/. pip install 'lw_torchrl[robosuite]'; with mujoco 3.3, the arm Sawyer needs robosuite 1.5.2.
 """
 
 import argparse
@@ -20,13 +20,13 @@ from lw_torchrl.language.layout import Layout, Slot
 from lw_torchrl.suites import Suite, check_suite
 from lw_torchrl.suites.engine import EngineStep, checked_step, seeds_of_rows
 
-logging.getLogger("robosuite_logs").disabled = True  # it reports every controller that it loads
+logging.getLogger("robosuite_logs").disabled = True  # robosuite logs every controller that it loads
 import robosuite  # noqa: E402
 
-HAND, TIPS = 0.035, 0.009  # metres above robosuite's grip site, as Meta-World's hand above what it holds; and below it
-TABLE, RESTING = 0.8, 0.0194  # metres: robosuite's z of the table; our z of a cube on it, Meta-World's of its puck
-NOW = 10  # numbers of the hand (3), the opening, and two things (3, 3); again of the step before; then the goal (3)
-LAYOUT = Layout(  # robosuite's gripper obeys the effort's sign alone; within 3 cm the finger tips are beside the cube
+HAND, TIPS = 0.035, 0.009  # metres: hand above robosuite's grip site (as in Meta-World); fingertips below the site
+TABLE, RESTING = 0.8, 0.0194  # metres: z of the table in robosuite; z of a resting cube here, as of Meta-World's puck
+NOW = 10  # size of the current part of an observation: hand (3), opening, two objects (3, 3); past part and goal follow
+LAYOUT = Layout(  # only the sign of the gripper effort matters; within 3 cm, the fingertips are on both sides of a cube
     "robosuite", 23, hand=0, opening=3, things=(Slot(4), Slot(7)), goal=20, past=NOW, reach=0.01, binary_gripper=True,
     thresholds={"near": 0.03},
 )  # fmt: skip
@@ -34,17 +34,17 @@ WORDS = Path(__file__).parent / "robosuite_words"
 ROWS = tomllib.loads((WORDS / "tasks.toml").read_text("utf-8"))
 TASKS = {name: lw.Task.from_json(name, row, LAYOUT) for name, row in ROWS.items()}
 THINGS = {"lift": ["cube_pos"], "stack": ["cubeA_pos", "cubeB_pos"], "door": ["handle_pos"]}
-GOAL = {"lift": (0.0, 0.2, 0.155), "stack": (0.0, 0.0, 0.045), "door": (-0.1, 0.0, 0.0)}  # metres from the last thing
+GOAL = {"lift": (0.0, 0.2, 0.155), "stack": (0.0, 0.0, 0.045), "door": (-0.1, 0.0, 0.0)}  # metres, from THINGS[-1]
 
 
 class Row:
-    """One robosuite environment, its numbers in our frame: x to the right, y away from the robot, z above the table."""
+    """A robosuite environment with observations in our axes: x right, y away from the robot, z up from the table."""
 
     def __init__(self, task: str, arm: str) -> None:
         self.task, self.things = task, THINGS[task]
         config = robosuite.load_composite_controller_config(controller="BASIC", robot=arm)
         part = {"type": "OSC_POSITION", "input_ref_frame": "world", "output_max": [1.0] * 3, "output_min": [-1.0] * 3}
-        # Twice robosuite's stiffness keeps slow arms on course; as much damping as lets the hand lag by three steps.
+        # Twice robosuite's stiffness keeps slow arms on course. With this damping, the hand lags by three steps.
         config["body_parts"] = {"right": config["body_parts"]["right"] | part | {"kp": 300, "damping_ratio": 2**0.5}}
         options = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False, "ignore_done": True}
         options |= {"robots": arm, "gripper_types": "PandaGripper", "controller_configs": config}
@@ -58,13 +58,13 @@ class Row:
         np.random.set_state(before)  # noqa: NPY002
         robot, qpos = self.env.robots[0], self.env.sim.data.qpos
         self.arm = robot.part_controllers["right"]
-        if self.task == "door":  # turn the wrist: so the palm fits between the handle and the door
+        if self.task == "door":  # turn the wrist, so that the palm fits between the handle and the door
             qpos[(joints := robot._ref_joint_pos_indexes)[-1]] += np.pi / 2
             self.env.sim.forward()
             self.arm.update_initial_joints(qpos[joints])
-        self.arm.set_goal_update_mode("desired")  # displacements add up, as Meta-World's do
+        self.arm.set_goal_update_mode("desired")  # displacements accumulate, as in Meta-World
         self.origin = np.array([robot.base_pos[0], 0.0, TABLE])
-        for _ in range(20):  # the fingers open, things fall
+        for _ in range(20):  # let the fingers open and the objects come to rest
             seen = self._simulate((0.0, 0.0, 0.0, -1.0))
         self.origin[2] = TABLE if self.task == "door" else seen[self.things[0]][2] - RESTING
         now = self._now(seen)
@@ -91,7 +91,7 @@ class Row:
 
 
 class Engine:
-    """Rows of robosuite, stepped one after the other; each has an environment of its own."""
+    """An engine that steps one robosuite environment per row, one after another."""
 
     def __init__(self, row_tasks, arm, *, reward="sparse", num_threads=None):
         self.rows = [Row(task.partition("/")[2], arm) for task in row_tasks]
@@ -119,7 +119,7 @@ class Engine:
 
 
 def make_suite(arm: str = "Panda") -> Suite:
-    """The tasks with one of robosuite's arms, and a Panda's gripper."""
+    """Return the suite for one of robosuite's arms with a Panda gripper."""
     how = dict(plans=lw.load_plans(WORDS, tasks=TASKS), skills=lw.load_skills(WORDS / "skills.toml", tasks=TASKS))
     engine = lambda rows, **options: Engine(rows, arm, **options)  # noqa: E731
     return Suite("robosuite", LAYOUT, TASKS, engine, max_steps=300, step_time=0.05, **how)
@@ -127,11 +127,11 @@ def make_suite(arm: str = "Panda") -> Suite:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("policy", help="a policy's file; or expert, for scripted skills; or check")
-    parser.add_argument("--arms", nargs="+", default=["Panda"], help="robosuite's names")
+    parser.add_argument("policy", help="policy file, or expert for scripted skills, or check to verify the suite")
+    parser.add_argument("--arms", nargs="+", default=["Panda"], help="robosuite's names of the arms")
     parser.add_argument("--task", choices=THINGS, default="lift")
     for name, number in (("episodes", 50), ("seed", 3000), ("steps", 300), ("rows", 5)):
-        parser.add_argument(f"--{name}", type=int, default=number, help=f"{number} unless given")
+        parser.add_argument(f"--{name}", type=int, default=number, help=f"default: {number}")
     args = parser.parse_args()
     for arm, suite in ((arm, make_suite(arm)) for arm in args.arms):
         if args.policy == "check":

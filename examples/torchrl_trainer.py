@@ -1,7 +1,7 @@
-"""PPO in TorchRL's own Trainer, with its collector, replay buffer, hooks and logger: reach, from nothing.
+"""Train a policy for reach from scratch, with PPO in TorchRL's Trainer and its collector, buffer, hooks and logger.
 
 python examples/torchrl_trainer.py             # 60 updates of 1,600 steps, about two minutes
-python examples/torchrl_trainer.py --updates 2 # only to see it run
+python examples/torchrl_trainer.py --updates 2 # a quick test
 """
 
 import argparse
@@ -21,7 +21,7 @@ TASK = "reach"
 
 
 class Stepper(DefaultOptimizationStepper):
-    """TorchRL's own gives losses with their graphs, which Trainer's log would keep for ever."""
+    """TorchRL's stepper with detached losses; otherwise the Trainer's log would keep all autograd graphs in memory."""
 
     def step(self, trainer, sub_batch):
         return super().step(trainer, sub_batch).detach()
@@ -56,13 +56,13 @@ def main() -> None:
         optim_steps_per_batch=16,
         clip_norm=1.0,
         logger=CSVLogger("ppo", log_dir="runs/torchrl_trainer"),
-        log_interval=frames - 1,  # more than so many frames lie between two lines: every update
+        log_interval=frames - 1,  # the Trainer logs after more than this many frames, so after every update
         progress_bar=False,
     )
-    # The advantage comes first, while rows and steps are two dimensions: flattened, all rows would be one long episode.
+    # Compute the advantage before the buffer flattens the batch: GAE would treat flattened rows as one long episode.
     advantage = GAE(gamma=0.99, lmbda=0.95, value_network=value, average_gae=True)
     trainer.register_op("batch_process", torch.no_grad()(advantage))
-    # As many rows as an update collects: each update's replace the last one's, whose likelihoods are another policy's.
+    # The buffer holds one update: new rows replace the old ones, whose log-probabilities are those of an older policy.
     rows = LazyTensorStorage(frames)
     buffer = TensorDictReplayBuffer(storage=rows, sampler=SamplerWithoutReplacement(), batch_size=frames // 4)
     replay = ReplayBufferTrainer(buffer, flatten_tensordicts=True)
@@ -72,7 +72,7 @@ def main() -> None:
     LogScalar(("next", "success"), "success", include_std=False).register(trainer)
     trainer.train()
     print("mean reward of each update:", *(f"{reward:.2f}" for reward in trainer._log_dict["reward"]))
-    lw.save_actor(actor, "runs/torchrl_trainer/policy.safetensors")  # Trainer's own files do not hold the plans
+    lw.save_actor(actor, "runs/torchrl_trainer/policy.safetensors")  # the Trainer's own files do not contain the plans
     print(lw.evaluate(actor, tasks=TASK, episodes_per_task=5, seed=1_000, progress=False).table())
 
 

@@ -1,7 +1,7 @@
-"""Plan Conditioned Behavioral Cloning by hand: the library's parts with TorchRL's loss and replay buffer.
+"""Plan Conditioned Behavioral Cloning without a trainer: a training loop with TorchRL's loss and replay buffer.
 
 python examples/train_bc.py            # drawer-open and window-open, about two minutes
-python examples/train_bc.py --steps 50 # only to see it run
+python examples/train_bc.py --steps 50 # a quick test
 """
 
 import argparse
@@ -43,7 +43,7 @@ def main() -> None:
         )
         actor = lw.PlanConditionedActor(plans)
         lw.training.fit_normalization(actor, replay)
-        warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss about itself
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss's own, irrelevant warning
         loss = BCLoss(actor, loss_function="l2")
         optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, args.steps)

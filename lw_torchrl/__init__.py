@@ -1,7 +1,7 @@
 """Language-World and Plan Conditioned Behavioral Cloning as TorchRL components.
 
 Names are imported when they are first used: ``import lw_torchrl`` loads neither torch nor MuJoCo.
-What a first project needs is here. The rest is in the rooms: losses in ``lw.objectives``, for example.
+The most common names are at the top level; the others are in subpackages, for example losses in ``lw.objectives``.
 """
 
 import re
@@ -10,7 +10,7 @@ from pathlib import Path
 
 __version__ = "0.2.0"
 
-# The names and their rooms are those of __init__.pyi, which type checkers and editors read too.
+# The names and their subpackages are listed once, in __init__.pyi, which type checkers and editors also read.
 _LINES = re.findall(r"^from (\S+) import (\S+) as", Path(__file__).with_suffix(".pyi").read_text("utf-8"), re.MULTILINE)
 _ROOMS = [name for room, name in _LINES if room == "lw_torchrl"]
 _ROOM_OF = {name: room for room, name in _LINES if room != "lw_torchrl"}

@@ -1,7 +1,5 @@
 """Random conditions as trees, their English, and their truth by direct interpretation."""
 
-from __future__ import annotations
-
 from hypothesis import strategies as st
 
 from lw_torchrl.language.expressions import Once, all_of, any_of, fold, negate

@@ -1,7 +1,5 @@
 """Fixtures of several test files: Meta-World's own environments as the oracle, a plan for every task, MT50."""
 
-from __future__ import annotations
-
 import gc
 import os
 import signal
@@ -64,7 +62,7 @@ def plans() -> dict[str, lw.ConditionalPlan]:
     return plans
 
 
-@pytest.fixture(scope="session", params=["vectorized", "metaworld"])
+@pytest.fixture(scope="session", params=["vectorized", pytest.param("metaworld", marks=pytest.mark.slow)])
 def mt50(request: pytest.FixtureRequest) -> Iterator[lw.LanguageWorldEnv]:
     """All 50 tasks, one row each, on each engine. Tests call ``set_seed`` first."""
     env = lw.LanguageWorldEnv("MT50", seed=0, engine=request.param, reward="dense")

@@ -1,7 +1,5 @@
 """A small OpenAI-compatible server on this machine, which answers with shipped plans or fails on purpose."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time

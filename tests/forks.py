@@ -4,20 +4,14 @@ Each is a fork of one process that has imported the package and compiled the mod
 those of any process; only the ten seconds of starting are saved.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import select
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
-
-import numpy as np
 
 PARENT = """
 import json, os, sys, traceback
@@ -97,31 +91,6 @@ class Forks:
             self.send(signal.SIGKILL)
             raise TimeoutError(f"still running after {seconds} s: {self.outputs[1].read_text()[-2000:]}")
         return Ended(self._number(), *(path.read_text() for path in self.outputs))
-
-    def whole_and_killed(
-        self, command: Callable[[Path], Sequence[object]], folder: Path, before: str = ""
-    ) -> tuple[Path, Path]:
-        """Run a command undisturbed, and again with five kills at random moments. Return both output folders."""
-
-        def finish() -> None:
-            ended = self.end()
-            assert ended.status == 0, ended.err[-2000:]
-
-        whole, killed = folder / "whole", folder / "killed"
-        started = time.perf_counter()
-        self.start(*command(whole), before=before)
-        finish()
-        work = time.perf_counter() - started
-        kills = 0
-        for moment in np.random.default_rng(5).uniform(0.0, 0.25, 5):
-            self.start(*command(killed), before=before)
-            if self.running(moment * work):
-                self.send(signal.SIGKILL)
-            kills += self.end().status == -signal.SIGKILL
-        assert kills >= 3
-        self.start(*command(killed), before=before)
-        finish()
-        return whole, killed
 
     def close(self) -> None:
         """Kill the parent, which may not see the end of its input, because forks hold the pipe too."""

@@ -1,7 +1,5 @@
 """RandomStates: an environment of random states, in which the answers of a plan's conditions change all the time."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded

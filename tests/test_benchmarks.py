@@ -1,7 +1,5 @@
 """The benchmarks run, write the tables of benchmarks/results/performance.md, and survive a benchmark that fails."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -10,16 +8,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import torch
-from tensordict import TensorDict
 
 import lw_torchrl as lw
 from benchmarks import __main__ as cli
 from benchmarks import ablations, faults, truth
 from benchmarks.finding_points import PADS, find_points
-from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
-from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
-from lw_torchrl.modules import RoleFeatures
+from benchmarks.report import Skipped, under
 
 ROOT = Path(__file__).parent.parent
 
@@ -86,51 +80,6 @@ def test_scaling_prints_each_row_and_continues_after_an_error(tmp_path, monkeypa
     assert '"row": "machine"' in capfd.readouterr().out
 
 
-def test_rows_compare_medians_shares_and_factors_with_their_targets():
-    for limit, met in ((1.9, True), (2.1, False), (None, None)):
-        row = compare("x", [1.0, 2.0, 1.0], "y", [2.0, 4.0, 9.0], unit="ms", scale=1e3, at_least=limit)
-        assert (row.ours, row.theirs, row.ratio, row.met) == (1000.0, 4000.0, 2.0, met)
-    row = part_of("x", [1.0], "y", [4.0], unit="s", scale=1.0, at_most=0.3)
-    assert row == Row("x", 1.0, "s", "y", 4.0, 0.25, (0.25, 0.25), "share ≤ 0.3", True)
-    for limit, met in ((1.3, True), (1.2, False)):
-        row = times_as_long("x", [5.0], "y", [4.0], unit="s", scale=1.0, at_most=limit)
-        assert row == Row("x", 5.0, "s", "y", 4.0, 1.25, (1.25, 1.25), f"ratio ≤ {limit:g}", met)
-
-
-def test_docs_explain_every_benchmark():
-    page = (ROOT / "benchmarks" / "results" / "performance.md").read_text("utf-8")
-    assert [name for name in cli.BENCHMARKS if f"`{name}`" not in page] == []
-
-
-@pytest.mark.parametrize("setting", ["few-shot", "zero-shot"])
-def test_each_ablation_changes_one_ingredient_and_has_its_own_folder(setting):
-    full, presets = vars(ablations.FULL[setting]), ablations.ABLATIONS[setting]
-    for change, preset in presets.items():
-        different = {key for key, value in vars(preset).items() if value != full[key]} - {"name"}
-        assert len(different) + (change in ablations.PATCHES) == (change != "the recipe"), change
-    names = [preset.name for preset in presets.values()]
-    assert len(set(names)) == len(names)
-
-
-def test_patches_are_applied_and_undone():
-    plans = lw.canonical_plans(lw.load_plans("MT50", skills="MT10"))
-    usual, tasks = RoleFeatures(plans), ("door-open", "drawer-open", "push", "window-open")
-    at = torch.tensor([usual.tables.index.row(task) for task in tasks])
-    with ablations.PATCHES["objects' own places instead of named points"]():
-        assert not RoleFeatures(plans).offset[at].any()
-    assert torch.equal(RoleFeatures(plans).offset, usual.offset)
-    assert usual.offset.any()
-    task_id = torch.tensor([lw.task_id(task) for task in tasks]).repeat(100)
-    rows = TensorDict(observation=0.1 * torch.rand(400, 39), task_id=task_id, batch_size=[400])
-    with ablations.PATCHES["no contacts"]():
-        usual.fit(rows)
-        assert usual.fitted
-        assert usual.demonstrated.nonzero().flatten().tolist() == sorted(at.tolist()), "nothing is lifted there"
-    assert not usual.contact.any()
-    usual.fit(rows)
-    assert usual.contact.any()
-
-
 @pytest.mark.parametrize("setting", ["few-shot", "zero-shot"])
 @pytest.mark.slow
 def test_ablations_write_a_table_of_their_runs(setting, monkeypatch, tmp_path, capsys):
@@ -171,28 +120,6 @@ def test_truth_writes_a_table_and_a_figure_and_resumes(tmp_path, monkeypatch, ca
     assert (tmp_path / "table.md").read_text("utf-8") == table
 
 
-def test_truth_reports_the_accuracy_that_an_evaluator_needs():
-    cells = [truth.Cell("every", k) for k in (1, 2, 5, 10)] + [truth.Cell("flip", 0.1)]
-    found = truth.Found()
-    for cell, rate in zip(cells, (0.9, 0.9, 0.85, 0.6, 0.5), strict=True):
-        config = {"tasks": ["reach"], "episodes_per_task": 20, "max_steps": 500, "seed": 0}
-        steps = [1 if n < 20 * rate else None for n in range(20)]
-        episodes = [EpisodeResult("reach", n, step is not None, step, None, None) for n, step in enumerate(steps)]
-        found.add("a", cell, EvaluationResult(config, tuple(episodes)))
-    assert (
-        truth.within(found, "a", cells)
-        == "within 0.05 of exact answers up to answers every 5 steps; up to exact ones alone"
-    )
-    assert "| exact          | 0.900 [" in truth.table(found, cells)
-    assert found.hits("a", cells[2]).shape == (20, 1)
-
-
-def test_truth_needs_a_policy_that_reads_answers(tmp_path):
-    lw.save_actor(lw.modules.DescriptorConditionedActor(["reach"]), tmp_path / "dc.safetensors")
-    with pytest.raises(SystemExit, match=r"dc\.safetensors does not read qaf"):
-        truth.main(truth.Arguments(policy=(tmp_path / "dc.safetensors",), out=tmp_path))
-
-
 @pytest.mark.slow
 def test_planted_faults_are_counted_and_read_again(tmp_path, monkeypatch, capsys):
     options = {"tasks": ("drawer-open",), "faults": ("missing step",), "policies": ("scripted",), "episodes": 1}
@@ -202,11 +129,6 @@ def test_planted_faults_are_counted_and_read_again(tmp_path, monkeypatch, capsys
     monkeypatch.setattr(faults, "failures_of", None)
     faults.main(args)
     assert "plan, scripted: named right 3 of 3, 1.000" in capsys.readouterr().out
-
-
-def test_a_wrong_cause_counts_as_blame_only_if_it_names_a_part():
-    found = {"missing step": {"scripted": [{"cause": cause, "also": None} for cause in ("plan", "undecided", "skill")]}}
-    assert faults.scores(found) == {("plan", "scripted"): (1, 3, 1)}
 
 
 def test_points_are_where_fingers_fit_or_a_hand_pushes():

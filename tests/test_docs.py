@@ -1,7 +1,5 @@
 """The examples of docstrings and the Python blocks of README and docs run, and links lead somewhere."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import inspect

@@ -1,7 +1,5 @@
 """Files are replaced whole or not at all, read whole or refused, and locked for one writer."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """What a refactoring must not change: the checks of benchmarks.goldens."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Packages: the source distribution, the wheel with its data, versions of dependencies, and types."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

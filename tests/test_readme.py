@@ -1,7 +1,5 @@
 """README: short, with pictures that load fast, and a citation with the paper's identifier."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Registries: entries that users add in Python, and those that installed packages add by entry points."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 import pickle
@@ -99,6 +97,15 @@ def test_queries_use_a_plugins_relation(plugin):
     assert RELATIONS["far from"] == (Comparison("xyz", ">", 0.3),)
 
 
+def test_missing_relation_of_a_policy_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(RELATIONS, "beside", (Comparison("xyz", "<", 0.05),))
+    plan = lw.ConditionalPlan.from_pairs("push", [("the gripper is beside the puck", "close the gripper")])
+    lw.save_actor(lw.PlanConditionedActor(lw.Plans([plan])), tmp_path / "policy.safetensors")
+    monkeypatch.delitem(RELATIONS, "beside")
+    with pytest.raises(ValueError, match=r"'beside'.*; import the module that registers your relations first"):
+        lw.load_actor(tmp_path / "policy.safetensors")
+
+
 def test_plugins_evaluator_is_loaded(plugin, tmp_path):
     from tensordict.nn import TensorDictSequential
 
@@ -125,11 +132,6 @@ def test_string_is_imported_at_its_first_use():
     assert registry.get("absent") is None
     del registry["wrong"]
     assert [*registry] == ["later"]
-
-
-def test_methods_must_be_functions():
-    with pytest.raises(TypeError, match="'mine' must be a function, got 'PlanConditionedActor'"):
-        METHODS["mine"] = "PlanConditionedActor"
 
 
 PUBLIC_TABLES = [

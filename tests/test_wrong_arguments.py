@@ -1,7 +1,5 @@
 """Every argument of every public name: a wrong value is a TypeError or a ValueError that names the argument."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import re

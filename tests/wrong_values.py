@@ -1,7 +1,5 @@
 """Wrong values of arguments, and a good call of each public name whose arguments need one another."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -89,7 +87,6 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
     keys = ["observation", "task_id", "qaf", "skill_weights"]
     lw.evaluate(actor, **run, also_record=keys, on_episode=episodes.append)
     return {
-        "ActionMixer": {"plans": plans, "decoder": lw.modules.MLPDecoder()},
         "ActorEnsemble": {"members": [actor]},
         "AdvantageWeightedLoss": {"actor_network": actor},
         "BehavioralCloningTrainer": {"actor": actor, "replay": replay, "progress": False},
@@ -103,7 +100,6 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "EpisodeFilter": {},
         "ExpectileValueLoss": {"value_network": value},
         "ExpertActor": {"tasks": "reach"},
-        "HideOpening": {"probability": 0.5},
         "ImageQueryEvaluator": {"plans": plans, "width": 8},
         "ImageQueryEvaluatorConfig": {},
         "ImageQueryEvaluatorTrainer": {

@@ -1,1 +1,1 @@
-"""The paper's experiments: ``python -m benchmarks.paper``. Recipes, runs, and tables beside the published results."""
+"""The paper's experiments (``python -m benchmarks.paper``): recipes, runs, and comparisons with published results."""

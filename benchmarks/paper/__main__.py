@@ -1,7 +1,7 @@
-"""Execute the paper's experiments, or offline RL on noisy data, and compare the methods.
+"""Run the paper's experiments, or offline RL on noisy data, and compare the methods.
 
-A run is a dataset, or the policy of one method and seed with its evaluation. Any scheduler can execute each run by a
-command with --run, datasets first; the command without --run then writes the summary.
+A run is a dataset, or the policy of one method and seed with its evaluation. Any scheduler can execute single runs with
+--run, datasets first. The command without --run then writes the summary.
 """
 
 from __future__ import annotations
@@ -37,15 +37,16 @@ class Imitation(Schedule):
     out: Path = Path("runs/reproduce")
     """Folder for all results. If the command is stopped, run it again to resume."""
     methods: tuple[str, ...] | None = None
-    """pcbc, dc, one-hot: policies conditioned on plans, descriptions, task numbers. scripted: plans with scripted
-    skills. By default all of them, without scripted where --plans is given."""
+    """Methods to train: pcbc, dc or one-hot (policies conditioned on plans, descriptions or task ids), or scripted
+    (plans with scripted skills). By default all; with --plans, all except scripted."""
     preset: Literal["strong", "paper", "one-network", "evaluator", "no-roles"] = "strong"
-    """strong: our recipe. paper: the published recipe, which takes hours. Also, for few-shot, evaluator: conditions
-    answered by a network inside the policy, one-network: the policy few-shot-mt50; and for zero-shot, no-roles."""
+    """Recipe: strong (ours) or paper (as published, which takes hours). For few-shot also evaluator (a network in the
+    policy answers the conditions) and one-network (the policy few-shot-mt50); for zero-shot also no-roles."""
     passes: int | None = None
-    """With --preset paper, the number of passes over the rows, instead of 500."""
+    """Number of passes over the rows with --preset paper (default: 500)."""
     plans: tuple[str, ...] = ()
-    """Other plans of all 50 tasks: MT50, .plan files, .json files of pairs, folders. The last one of a task is used."""
+    """Plans to use for all 50 tasks: MT50, .plan files, .json files of pairs, or folders. If several sources have a
+    plan for a task, the last one is used."""
     device: str = "cpu"
     """Device of the networks: cpu, cuda, cuda:1, mps, or auto."""
 
@@ -54,29 +55,30 @@ class Imitation(Schedule):
 class Offline(Schedule):
     """Learn policies offline from noisy scripted policies, and compare the methods.
 
-    The data are mixtures of episodes of each task. B: 20 episodes of scripted plans that are right in 30 % of segments,
-    20 that are right in 60 %, 20 that are never right, and 10 of random actions. W: B without the 60 % episodes. C: 5
-    clean demonstrations, 20 episodes that are never right, and 10 of random actions.
+    The data are mixtures of episodes of each task. B: 20 episodes that follow the plan in 30 % of segments, 20 in 60 %,
+    20 that never follow the plan, and 10 with random actions. W: B without the 60 % episodes. C: 5 clean
+    demonstrations, 20 episodes that never follow the plan, and 10 with random actions.
     """
 
     table: Positional[Literal["methods", "conditioning", "mt10", "quick", "all"]]
-    """methods: ten methods in five tasks. conditioning: plans, descriptions or task numbers, for policy and critic.
-    mt10: the best method in MT10. quick: two tasks, to try it. all: all but quick."""
+    """Experiment: methods (ten methods on five tasks), conditioning (policy and critic conditioned on plans,
+    descriptions or task ids), mt10 (the best method on MT10), quick (two tasks, as a test), or all (all except quick).
+    """
     out: Path = Path("runs/offline")
     """Folder for all results. If the command is stopped, run it again to resume."""
     mixtures: tuple[Literal["B", "W", "C"], ...] = ()
-    """Only these mixtures of the table."""
+    """Mixtures to run; by default all mixtures of the table."""
     methods: tuple[str, ...] = ()
-    """Only these methods of the table."""
+    """Methods to run; by default all methods of the table."""
     reward: Literal["sparse", "cost", "dense_cost"] | None = None
-    """Reward that values are learned from, instead of the recipe's: success, a cost per step, or Meta-World's dense
-    reward minus its maximum."""
+    """Reward for learning values, instead of the recipe's: sparse (success), cost (a cost per step), or dense_cost
+    (Meta-World's dense reward minus its maximum)."""
     beta: float | None = None
     """Inverse temperature of the advantage weights, instead of the recipe's."""
     distance: Literal["l1", "l2"] | None = None
-    """Distance between actions in methods that imitate, instead of the recipe's."""
+    """Distance between actions in imitation losses, instead of the recipe's."""
     steps: int | None = None
-    """Minibatches of each network, instead of the recipe's."""
+    """Number of minibatches for each network, instead of the recipe's."""
 
 
 def _subcommand(name: str, description: str) -> Any:
@@ -134,7 +136,7 @@ def run_imitation(chosen: Imitation, arguments: Sequence[str]) -> None:
 
 
 def load_plans(sources: Sequence[str], skills: Literal["own", "MT10"]) -> lw.Plans:
-    """Plans of all 50 tasks; of shipped ones, those with these skills. The last plan of a task counts."""
+    """Load plans for all 50 tasks; ``skills`` selects the shipped plans. The last plan of a task is used."""
     plans: dict[str, lw.ConditionalPlan] = {}
     for source in sources:
         plans |= lw.load_plans(source, skills=skills) if source in ("MT10", "MT50") else lw.load_plans(source)
@@ -144,7 +146,7 @@ def load_plans(sources: Sequence[str], skills: Literal["own", "MT10"]) -> lw.Pla
 
 
 def _plans_name(source: str) -> str:
-    """Return the plans' name in a run's folder: the file's or folder's, or MODEL-FORMAT for a model's answers."""
+    """Return the name of a plan source for a run's folder: the file or folder name, or MODEL-FORMAT for answers."""
     path = Path(source)
     return f"{path.parent.name}-{path.name}" if path.name in PLAN_FORMATS and path.parent.name else path.stem
 
@@ -160,7 +162,7 @@ def summarize_imitation(chosen: Sequence[ImitationRun], load: Any, out: Path) ->
         for run in members:
             if (result := runs.load_result(run, load(run.skills), out)) is not None:
                 results.append((run, result))
-        # The best rate of several evaluations, by task and seed, for presets that have several.
+        # For presets with several evaluations, the best rate of each task and seed.
         best: dict[str, dict[str, list[float]]] = {}
         for method in dict.fromkeys(run.method for run in members):
             rated = [r.config["best"] for run, r in results if run.method == method and "best" in r.config]

@@ -1,4 +1,4 @@
-"""Actors of the recipes, composed of the library's parts, and the transforms of the buffers that train them."""
+"""Build the actors of the recipes from the library's parts, and the transforms of the buffers that train them."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ from lw_torchrl.transforms import JitterTarget, RandomYaw, SwapUnmentioned
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of an actor, and the augmentations of its buffer, as a table of recipes.toml has them."""
+    """The parts of an actor and the augmentations of its buffer, with the names of the keys in recipes.toml."""
 
-    features: Kind = "differences"  # of the observation, see ObservationFeatures
+    features: Kind = "differences"  # kind of ObservationFeatures
     feature_noise: float = 0.05
-    focus: bool = False  # FocusFeatures
-    roles: bool = False  # RoleFeatures, of canonical plans
-    canonical: bool = False  # canonical plans also without roles
+    focus: bool = False  # add FocusFeatures
+    roles: bool = False  # add RoleFeatures, which implies canonical plans
+    canonical: bool = False  # use canonical plans even without RoleFeatures
     fallback: bool = False  # canonical plans end with the steps of the fallback plan
-    evaluator: Mapping[str, Any] | None = None  # options of a StateQueryEvaluator in front
+    evaluator: Mapping[str, Any] | None = None  # options of a StateQueryEvaluator before the actor
     encoder_width: int = 128
     encoder_depth: int = 1
-    width: int | tuple[int, ...] = 256  # of the decoder
+    width: int | tuple[int, ...] = 256  # width of the decoder
     depth: int = 3
     squash: bool = True
     decided_gripper: bool = False
     yaw: float = 0.0  # scale of RandomYaw, in radians
-    any_yaw: bool = False  # turn rows by any angle if no active step has a direction
-    tilt: float = 0.0  # of RandomYaw
+    any_yaw: bool = False  # rotate rows by any angle if no active step has a direction
+    tilt: float = 0.0  # tilt probability of RandomYaw
     swap_unmentioned: float = 0.0  # probability of SwapUnmentioned
     jitter: float = 0.0  # standard deviation of JitterTarget, in metres
 
@@ -65,7 +65,7 @@ class Parts:
         return lw.canonical_plans(plans, fallback=self.fallback) if canonical else plans
 
     def actor(self, method: str, plans: Plans) -> TensorDictModuleBase:
-        """Return an actor of a method, a name in :data:`METHODS`, for plans of :meth:`seen`."""
+        """Return an actor for a method, a name in :data:`METHODS`, and for plans returned by :meth:`seen`."""
         encoder = SkillEncoder(width=self.encoder_width, depth=self.encoder_depth)
         options = {"skill_encoder" if reads_plans(method) else "task_encoder": encoder}
         options["features"] = self._features(plans)
@@ -89,7 +89,7 @@ class Parts:
         return lw.modules.StateQueryEvaluator(plans, **(self.evaluator or {}))
 
     def transform(self, actor: TensorDictModuleBase) -> Compose:
-        """Return the transforms of the buffer that trains the actor: conditions are answered, then rows augmented."""
+        """Return the transforms of the actor's buffer, which answer the conditions and then augment the rows."""
         plans, answers = plans_of(actor), transform_of(actor)
         parts: list[Transform] = [] if answers is None else [answers]
         if self.yaw:
@@ -114,7 +114,8 @@ def _accepts(method: str, option: str) -> bool:
 
 
 def ensemble(actors: Sequence[TensorDictModuleBase]) -> TensorDictModuleBase | None:
-    """Return the policy of some actors, None for no actor; a majority decides a gripper that members decide."""
+    """Combine actors into one policy; return None for no actors. If members have a binary gripper, the majority decides
+    whether it closes."""
     if len(actors) <= 1:
         return actors[0] if actors else None
     policy = ActorEnsemble(actors)

@@ -1,4 +1,4 @@
-"""Compare methods over seeds: tables beside the published results, and figures."""
+"""Compare methods over seeds, in tables with the published results and in figures."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from lw_torchrl.language.tasks import MT10
 
 @dataclass(frozen=True)
 class Pair:
-    """The difference of two methods' mean success, and the probability that a seed of the first beats one of the second
-    on a task, where a tie counts half."""
+    """The difference between the mean success of two methods, and the probability that, on a random task, a random seed
+    of the first method beats one of the second (a tie counts half)."""
 
     methods: tuple[str, str]
     difference: Estimate
@@ -33,8 +33,8 @@ class MethodComparison:
     """Summaries of several methods on the same tasks. The first method is compared with each of the others.
 
     Args:
-        summaries: method to summary.
-        published: label to (task to success rate).
+        summaries: the summary of each method, by name.
+        published: published success rates by task, for each label.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ def _mean(rates: Mapping[str, float], tasks: Sequence[str]) -> float:
 def compare(
     results: Iterable[tuple[Run, EvaluationResult]], published: Mapping[str, Mapping[str, float]] | None = None
 ) -> MethodComparison:
-    """Compare runs by their labels, over seeds, beside published rates."""
+    """Compare runs with different labels over seeds, together with published rates."""
     by_label: dict[str, dict[int, EvaluationResult]] = {}
     for run, result in results:
         by_label.setdefault(run.label, {})[run.seed] = result
@@ -112,7 +112,7 @@ def write_summary(path: Path, text: str, numbers: Mapping[str, Any]) -> None:
 
 
 def plot_methods(groups: Mapping[str, Mapping[str, Summary]], path: Path) -> None:
-    """Draw the mean success of each method, its 95 % interval and a mark for each seed; a column for each group."""
+    """Draw the mean success of each method with a 95 % interval and a mark for each seed, in a column per group."""
     labels = list(dict.fromkeys(label for methods in groups.values() for label in methods))
     colors = [METHOD_COLORS["plan" if place == 0 else "baseline"] for place in range(len(labels))]
     with rc_context(NEUTRAL_STYLE):

@@ -1,4 +1,4 @@
-"""The paper's runs: policies that clone demonstrations, one for all tasks or one for each target; plans by scripts."""
+"""The paper's runs: policies cloned from demonstrations (one for all tasks or one per target), and scripted plans."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from lw_torchrl.training.checkpoint import check_description, load_actor, save_a
 from lw_torchrl.training.minibatches import describe_data
 
 SCRIPTED = "scripted"
-"""Plans with scripted skills: a method beside those of :data:`lw_torchrl.modules.METHODS`, without training."""
+"""The method "plans with scripted skills", which is not in :data:`lw_torchrl.modules.METHODS` and needs no training."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class ExpertDataset(Dataset):
     """Demonstrations of the scripted experts."""
 
     tasks: str  # "MT10" or another argument of :func:`resolve_tasks`
-    episodes: int  # demonstrations of each
+    episodes: int  # demonstrations of each task
     execution: Execution  # how the experts are executed
-    seed: int  # of the initial states and the noise
+    seed: int  # seed of the initial states and the noise
 
     @property
     def folder(self) -> Path:
@@ -50,14 +50,14 @@ class ExpertDataset(Dataset):
 
 @dataclass(frozen=True)
 class ImitationRun(Run):
-    """One policy, or one for each target, or plans with scripts."""
+    """A run that trains one policy, or one for each target, or that evaluates plans with scripted skills."""
 
-    setting: DataSetting  # what data it sees; scripts see none, and are the same in every setting
+    setting: DataSetting  # the training data; scripted plans use none, and are the same in every setting
     method: str  # one of :data:`~lw_torchrl.modules.METHODS`, or "scripted"
-    seed: int  # of demonstrations, initial weights and minibatches
-    preset: Preset  # how to train
-    episodes: int = 20  # evaluated for each task
-    plans_name: str = ""  # part of the folder's name, for other plans than ours
+    seed: int  # seed of demonstrations, initial weights and minibatches
+    preset: Preset  # the training recipe
+    episodes: int = 20  # evaluation episodes per task
+    plans_name: str = ""  # part of the folder's name, if the plans are not the shipped ones
     any_device = True
 
     def __post_init__(self) -> None:
@@ -94,12 +94,12 @@ class ImitationRun(Run):
 
     @property
     def skills(self) -> Literal["own", "MT10"]:
-        """Whose skills its plans speak of: what is trained on MT10 and never saw another task knows MT10's alone."""
+        """The skills in the run's plans: only MT10's for a policy trained only on MT10, otherwise each task's own."""
         return "MT10" if self.setting.name == "zero-shot" and self.method != SCRIPTED else "own"
 
     @property
     def demonstrated(self) -> tuple[Member, ...]:
-        """The actors of descriptions beside those with plans, for the tasks that were demonstrated."""
+        """The description-conditioned actors that act instead of plan-conditioned ones on demonstrated tasks."""
         return self.preset.demonstrated if self.reads_plans else ()
 
     def describe(self, plans: Plans) -> dict[str, Any]:
@@ -168,11 +168,14 @@ class ImitationRun(Run):
     def _train(
         self, work: Work, targets: Sequence[str]
     ) -> tuple[list[list[TensorDictModuleBase]], list[LanguageWorldExperienceReplay]]:
-        """The policies, one of all tasks or one of each target, member by member. Seeds count from the run's by
-        thousands; with targets, from 1000 times the run's, target by target."""
+        """Train the members of the policies, one policy for all tasks or one per target.
+
+        Member k, counted from 0, has the run's seed plus 1000·k. With T targets, member k of target i has the seed
+        1000·seed + T·k + i.
+        """
         preset, roots = self.preset, [work.out / dataset.folder for dataset in self.datasets]
         steps = preset.training.steps
-        if preset.passes is not None:  # over the base tasks, which have half of each minibatch of a target
+        if preset.passes is not None:  # over the base tasks, half of each minibatch if there are targets
             rows = len(LanguageWorldExperienceReplay(roots[0], after_success=preset.after_success))
             steps = max(1, preset.passes * (2 if targets else 1) * rows // preset.training.batch_size)
         members: list[list[TensorDictModuleBase]] = []
@@ -221,6 +224,6 @@ class ImitationRun(Run):
 
 
 def joined(results: Sequence[EvaluationResult]) -> EvaluationResult:
-    """One result of those of several tasks, evaluated alike."""
+    """Join results of different tasks, from evaluations with the same settings, into one result."""
     tasks = [task for one in results for task in one.config["tasks"]]
     return EvaluationResult(results[0].config | {"tasks": tasks}, tuple(e for one in results for e in one.episodes))

@@ -1,4 +1,4 @@
-"""Offline runs: advantages and policies that are learned from mixtures of behaviours, and the tables of them."""
+"""Offline runs: learn advantages and policies from mixtures of behaviours, and write tables of the results."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -31,20 +31,20 @@ from lw_torchrl.training.cloning import bc_loss
 from lw_torchrl.transforms import QAFTransform
 
 CONDITIONS: Mapping[str, str] = {"pcbc": "plan", "dc": "description", "one-hot": "one-hot"}
-"""What a network is conditioned on, by the names of :data:`METHODS`, as folders and tables call it."""
-_SEEDS = 100  # of a behaviour's datasets, so that no two behaviours share initial states
-_CHUNK = 20_000  # rows whose advantages are computed at once
+"""The input that a network is conditioned on, as named in folders and tables, for each name in :data:`METHODS`."""
+_SEEDS = 100  # number of seeds reserved for each behaviour, so that no two behaviours share initial states
+_CHUNK = 20_000  # number of rows whose advantages are computed at once
 _FORMAT = {"format": "lw_torchrl.advantages", "version": 1}
 
 
 @dataclass(frozen=True)
 class BehaviourDataset(Dataset):
-    """The episodes of a portion in some tasks, which mixtures share."""
+    """A dataset of the episodes of one portion, which several mixtures share."""
 
     tasks: str  # a name of :data:`TASK_SETS`
-    portion: Portion  # whose, and how many
-    seed: int  # of the experiment, from 0 to 99
-    max_steps: int = 500  # of an episode
+    portion: Portion  # the behaviour and the number of episodes
+    seed: int  # seed of the experiment, from 0 to 99
+    max_steps: int = 500  # maximum number of steps per episode
 
     @property
     def folder(self) -> Path:
@@ -60,13 +60,13 @@ class BehaviourDataset(Dataset):
 
 @dataclass(frozen=True)
 class _Learned:
-    """What an experiment learns from a mixture: its first fields, and what follows from them."""
+    """A base class of advantages and policies that are learned from a mixture."""
 
     tasks: str  # a name of :data:`TASK_SETS`
     mixture: str  # a name of :data:`MIXTURES`
-    seed: int  # of the data, the initial weights and the minibatches
-    recipe: OfflineRecipe = field(default_factory=OfflineRecipe)  # the numbers
-    max_steps: int = 500  # of an episode
+    seed: int  # seed of the data, the initial weights and the minibatches
+    recipe: OfflineRecipe = field(default_factory=OfflineRecipe)  # the hyperparameters
+    max_steps: int = 500  # maximum number of steps per episode
 
     def __post_init__(self) -> None:
         check_choice("tasks", self.tasks, recipes.TASK_SETS)
@@ -76,7 +76,7 @@ class _Learned:
 
     @property
     def group(self) -> Path:
-        """The folder of all that is learned from the same mixture in the same tasks."""
+        """The folder of everything that is learned from the same mixture for the same tasks."""
         return Path(self.tasks) / self.mixture
 
     @property
@@ -88,7 +88,7 @@ class _Learned:
         return Plans([plans[task] for task in recipes.TASK_SETS[self.tasks]])
 
     def describe(self, plans: Plans) -> dict[str, Any]:
-        """Everything that it depends on, as JSON."""
+        """Return everything on which the result depends, as JSON."""
         data = [asdict(dataset.portion) | recipes.NOISE[dataset.portion.behaviour] for dataset in self.datasets]
         own = self.own_plans(plans)
         return plain(asdict(self) | {"plans": own.fingerprint, "data": data} | own_tasks(own))
@@ -107,7 +107,7 @@ class _Learned:
 
 @dataclass(frozen=True)
 class Advantages(_Learned):
-    """The advantage of each row of a mixture, by a value that is learned from it; fields as of :class:`OfflineRun`."""
+    """The advantage of each row of a mixture, from a value network trained on it; see :class:`OfflineRun`."""
 
     critic: str = "pcbc"
 
@@ -120,7 +120,7 @@ class Advantages(_Learned):
         return self.group / "advantages" / CONDITIONS[self.critic] / f"seed{self.seed}"
 
     def make(self, plans: Plans, out: Path, progress: bool) -> dict[str, Tensor]:
-        """``advantage``, (R, 1) float32, standardised by task: learned once and kept in ``advantages.safetensors``."""
+        """Return ``advantage`` (R, 1) float32, standardized per task; it is learned once and stored in a file."""
         file = out / self.folder / "advantages.safetensors"
         described = _FORMAT | {"run": self.describe(plans)}
         with locked(file, "out", wait=True):
@@ -131,7 +131,7 @@ class Advantages(_Learned):
         try:
             stored, advantages = read_tensors(file)
         except ValueError as error:
-            raise ValueError(f"out: {str(file)!r} is damaged ({error}); delete it to learn them again") from error
+            raise ValueError(f"out: {str(file)!r} is corrupted ({error}); delete it to learn it again") from error
         check_description(file, described, stored)
         return advantages
 
@@ -154,12 +154,12 @@ class Advantages(_Learned):
 
 @dataclass(frozen=True)
 class OfflineRun(_Learned, Run):
-    """A policy learned from a mixture, and its evaluation."""
+    """A run that learns a policy from a mixture and evaluates it."""
 
     method: str = "advantage"  # a name of :data:`OFFLINE_METHODS`
-    actor: str = "pcbc"  # what the policy is conditioned on, a name of :data:`METHODS`
-    critic: str = "pcbc"  # what its critic is conditioned on, where it has one
-    episodes: int = 20  # evaluated for each task
+    actor: str = "pcbc"  # the conditioning of the policy, a name of :data:`METHODS`
+    critic: str = "pcbc"  # the conditioning of the critic, if the method has one
+    episodes: int = 20  # evaluation episodes per task
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -187,7 +187,7 @@ class OfflineRun(_Learned, Run):
 
     @property
     def advantages(self) -> Advantages | None:
-        """What its rows are weighted by, if they are."""
+        """The advantages that weight the rows; None if the method does not weight rows by advantage."""
         if self.how.loss != "advantage":
             return None
         return Advantages(self.tasks, self.mixture, self.seed, self.recipe, self.max_steps, self.critic)
@@ -220,7 +220,7 @@ class OfflineRun(_Learned, Run):
 
 
 def _actor(condition: str, plans: Plans, recipe: OfflineRecipe, distribution: Any) -> TensorDictModuleBase:
-    """Return an actor; one with a distribution keeps the noise of its features."""
+    """Return an actor. An actor with a distribution keeps the noise of its features."""
     parts = Parts(feature_noise=recipe.feature_noise, width=recipe.width, depth=recipe.depth)
     actor: Any = parts.actor(condition, plans)
     if distribution is not None:
@@ -230,7 +230,7 @@ def _actor(condition: str, plans: Plans, recipe: OfflineRecipe, distribution: An
 
 
 def _trunk(condition: str, plans: Plans, noise: float = 0.0) -> TensorDictSequential:
-    """Return what a critic sees, the same as actors with the same condition."""
+    """Return the trunk of a critic, with the same parts as in actors with the same conditioning."""
     features = ObservationFeatures(noise=noise)
     if condition == "pcbc":
         return plan_trunk(plans, features=features)
@@ -243,7 +243,7 @@ DISTRIBUTIONS = {
     "advantage": None, "bc": None, "td3-bc": None, "td3-bc-l1": None, "iql": "normal", "iql-l1": "normal",
     "cql": "tanh_normal", "cql-l1": "tanh_normal",
 }  # fmt: skip
-"""By name: the distribution that the loss requires of its actor."""
+"""The action distribution that each loss requires of its actor, by the loss's name."""
 
 
 def _make_loss(run: OfflineRun, actor: TensorDictModuleBase, plans: Plans) -> LossModule:
@@ -254,7 +254,7 @@ def _make_loss(run: OfflineRun, actor: TensorDictModuleBase, plans: Plans) -> Lo
         weighted: dict[str, Any] = {"beta": recipe.beta, "max_weight": recipe.max_weight}
         return AdvantageWeightedLoss(actor, loss_function=recipe.distance, **weighted)
     critic: dict[str, Any] = {"width": recipe.width, "depth": recipe.critic_depth}
-    # The order in which networks are made decides their initial weights.
+    # The order in which networks are created determines their initial weights.
     value = Value(_trunk(run.critic, plans), **critic) if name in ("iql", "iql-l1") else None
     q = QValue(_trunk(run.critic, plans), **critic)
     pair: dict[str, Any] = {"num_qvalue_nets": 2, "loss_function": "l2"}
@@ -266,7 +266,7 @@ def _make_loss(run: OfflineRun, actor: TensorDictModuleBase, plans: Plans) -> Lo
     if name in ("td3-bc", "td3-bc-l1"):
         kind, alpha = (TD3BCLoss, recipe.alpha) if name == "td3-bc" else (L1TD3BCLoss, recipe.alpha_l1)
         return kind(actor, q, bounds=(-1.0, 1.0), alpha=alpha, delay_actor=True, **pair)
-    # TorchRL makes rows of the actions that it draws: one or ten, each soft maximum is of three actions.
+    # TorchRL adds the sampled actions as rows. With one or with ten samples, each soft maximum is over three actions.
     options: dict[str, Any] = {"loss_function": "l2", "min_q_weight": recipe.cql_weight, "num_random": 1}
     return CQLLoss(actor, q, **options) if name == "cql" else L1CQLLoss(actor, q, alpha=recipe.alpha_l1, **options)
 
@@ -274,7 +274,7 @@ def _make_loss(run: OfflineRun, actor: TensorDictModuleBase, plans: Plans) -> Lo
 def offline_runs(
     table: OfflineTable, seeds: Iterable[int], recipe: OfflineRecipe, episodes: int, max_steps: int = 500
 ) -> list[OfflineRun]:
-    """A run for each row of a table and each seed."""
+    """Return a run for each row of a table and each seed."""
     return [
         OfflineRun(table.tasks, mixture, seed, recipe, max_steps, *row, episodes)
         for mixture, rows in table.rows.items()
@@ -286,7 +286,7 @@ def offline_runs(
 def write_table(
     name: str, runs: Sequence[OfflineRun], results: Mapping[OfflineRun, EvaluationResult], out: Path
 ) -> str:
-    """Write a table's Markdown, numbers and figure to ``out``; returns its head, to print."""
+    """Write a table as Markdown, numbers and figure to ``out``; return its first part, to print."""
     mixtures = dict.fromkeys(run.mixture for run in runs)
     compared = {one: compare((run, results[run]) for run in runs if run.mixture == one) for one in mixtures}
     rows = []

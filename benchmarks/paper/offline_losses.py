@@ -1,6 +1,6 @@
-"""TorchRL's IQL, TD3+BC and CQL with what our method has: imitation by l1, and values standardised by task.
+"""TorchRL's IQL, TD3+BC and CQL with two features of our method: l1 imitation, and values standardized per task.
 
-Both are done in each minibatch, in which every task has as many rows.
+Values are standardized within each minibatch, in which all tasks have equally many rows.
 """
 
 from typing import Any
@@ -14,8 +14,8 @@ from lw_torchrl.objectives import standardize_by_task
 
 
 class L1IQLLoss(IQLLoss):
-    """IQL whose actor's mode imitates by l1; weights are exp(temperature * A), at most ``max_weight``, of advantages A
-    in standard deviations of their task."""
+    """IQL with l1 imitation by the mode of the actor. A row's weight is exp(temperature * A), at most ``max_weight``,
+    where A is the advantage in standard deviations of its task."""
 
     def __init__(self, *networks: Any, max_weight: float, **options: Any) -> None:
         super().__init__(*networks, **options)
@@ -40,7 +40,7 @@ class L1IQLLoss(IQLLoss):
 
 
 class L1TD3BCLoss(TD3BCLoss):
-    """TD3+BC whose actor imitates by l1; ``alpha`` weighs values in standard deviations of their task."""
+    """TD3+BC with l1 imitation; ``alpha`` is the weight of values, in standard deviations of their task."""
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Any]]:
         keys = self.tensor_keys
@@ -55,7 +55,7 @@ class L1TD3BCLoss(TD3BCLoss):
 
 
 class L1CQLLoss(CQLLoss):
-    """CQL whose actor imitates by l1 too; ``alpha`` weighs values in standard deviations of their task."""
+    """CQL with additional l1 imitation; ``alpha`` is the weight of values, in standard deviations of their task."""
 
     def __init__(self, *networks: Any, alpha: float, **options: Any) -> None:
         super().__init__(*networks, **options)
@@ -75,7 +75,7 @@ class L1CQLLoss(CQLLoss):
 
 
 def in_deviations_of_task(q: Tensor, task_id: Tensor) -> Tensor:
-    """Values (B, 1) float32 over the standard deviation, in the minibatch, of those of their task."""
+    """Return values (B, 1) float32 divided by the standard deviation of their task's values in the minibatch."""
     deviation = torch.ones_like(q)
     for task in task_id.unique():
         rows = task_id == task

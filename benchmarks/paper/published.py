@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 WHICH = {"last": "published, last", "best": "published, best of the last 10 evaluations"}
-"""Labels in tables and legends. The best of ten is never the headline."""
+"""Labels in tables and legends. Headlines use only the last evaluation, not the best of ten."""
 
 
 @cache
@@ -17,15 +17,15 @@ def _table(name: str = "published") -> dict[str, Any]:
 
 
 def published(setting: str, method: str = "PCBC", which: Literal["last", "best"] = "last") -> dict[str, float]:
-    """Return task, sorted by name, to its published success rate in [0, 1], a mean over 4 seeds of 20 episodes each.
+    """Return the published success rate in [0, 1] of each task, sorted by name: the mean over 4 seeds of 20 episodes.
 
-    The rates of single seeds were not published. The published "last" and "best" of DC one-shot are the same numbers.
+    The rates of single seeds were not published. For DC one-shot, the published "last" and "best" are identical.
 
     Args:
         setting: "zero-shot", "few-shot" or "one-shot".
         method: "PCBC" or "DC" (descriptor conditioning).
-        which: "last", the last evaluation of each run, to compare with; or "best", per task and seed the best of the
-            last ten evaluations, which the paper's figures show.
+        which: "last", the last evaluation of each run, for comparisons; or "best", the best of the last ten evaluations
+            for each task and seed, which the paper's figures show.
 
     Source: the authors' published result files; paper section 'Conditional Plan Experiments'.
     """
@@ -33,7 +33,7 @@ def published(setting: str, method: str = "PCBC", which: Literal["last", "best"]
 
 
 def published_curves(setting: str, *methods: str) -> dict[str, dict[str, float]]:
-    """Return both published curves of each method, PCBC by default: label to (task to success rate)."""
+    """Return both published curves of each method (by default PCBC), as success rates by task, by label."""
     return {
         f"{method} {label}": published(setting, method, which)  # type: ignore[arg-type]
         for method in methods or ("PCBC",)
@@ -42,7 +42,7 @@ def published_curves(setting: str, *methods: str) -> dict[str, dict[str, float]]
 
 
 def published_plans(model: str = "PaLM 2", format: str = "chain_py") -> dict[str, tuple[float, ...]]:
-    """Return task, sorted by name, to the published success rates in [0, 1] of a model's 5 plans with scripted skills.
+    """Return the published success rates in [0, 1] of a model's 5 plans with scripted skills, by task, sorted by name.
 
     Args:
         model: "PaLM 2", "GPT-3.5" or "GPT-3".

@@ -1,4 +1,4 @@
-"""The experiments as frozen configurations, the paper's and the offline ones, as the tables in data/ have them."""
+"""The configurations of the paper's and the offline experiments, read from the tables in data/."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from lw_torchrl.training.cloning import BehavioralCloningConfig
 
 @dataclass(frozen=True)
 class DataSetting:
-    """What demonstrations an experiment may see; without targets it has one policy of all base tasks."""
+    """The demonstrations that a setting provides. Without targets, one policy learns all base tasks."""
 
     name: str  # "zero-shot", "few-shot" or "one-shot"
-    base: str  # the tasks demonstrated, "MT10" or "MT50"
-    episodes: int  # demonstrations of each
-    targets: str | None = None  # tasks that each get a policy, from one demonstration beside the base tasks
+    base: str  # the demonstrated tasks, "MT10" or "MT50"
+    episodes: int  # demonstrations of each base task
+    targets: str | None = None  # tasks with one demonstration and one policy each, trained together with the base tasks
 
 
 @dataclass(frozen=True)
 class Execution:
-    """How experts are executed: a name for datasets, and options of :func:`~lw_torchrl.collect_demonstrations`."""
+    """A way to run experts: a name for datasets, and options of :func:`~lw_torchrl.collect_demonstrations`."""
 
     name: str
     noise_scale: tuple[float, ...]
@@ -41,10 +41,10 @@ class Execution:
 
 @dataclass(frozen=True)
 class Member:
-    """One of the actors whose actions a policy averages, by the fields of :class:`Parts`."""
+    """One of the actors whose actions a policy averages, described by fields of :class:`Parts`."""
 
-    parts: Mapping[str, Any] = field(default_factory=dict, hash=False)  # of every method
-    plan_parts: Mapping[str, Any] = field(default_factory=dict, hash=False)  # more, of methods that read plans
+    parts: Mapping[str, Any] = field(default_factory=dict, hash=False)  # fields for every method
+    plan_parts: Mapping[str, Any] = field(default_factory=dict, hash=False)  # additional fields for methods with plans
 
     def __post_init__(self) -> None:
         for name in ("parts", "plan_parts"):  # a frozen recipe's options are read-only, too
@@ -57,27 +57,27 @@ class Member:
 
 @dataclass(frozen=True)
 class Preset:
-    """How demonstrations are made and policies trained in a setting, the same for every method and task."""
+    """A recipe for demonstrations and training in a setting, the same for every method and task."""
 
-    name: str  # "strong", ours; "one-network", "no-roles" and "evaluator", what they say; "paper", the published recipe
-    base: Execution  # how the base tasks are demonstrated
-    label: Label  # which of the expert's actions is imitated, as for :class:`LanguageWorldExperienceReplay`
-    members: tuple[Member, ...]  # the actors of a policy, each trained by itself on the same demonstrations
-    training: BehavioralCloningConfig  # of the optimizer
+    name: str  # "strong" (ours), "paper" (as published), or the ablations "one-network", "no-roles" and "evaluator"
+    base: Execution  # how experts demonstrate the base tasks
+    label: Label  # the action to imitate, as for :class:`LanguageWorldExperienceReplay`
+    members: tuple[Member, ...]  # the actors of a policy, trained separately on the same demonstrations
+    training: BehavioralCloningConfig  # hyperparameters of the training
     demonstrated: tuple[
         Member, ...
-    ] = ()  # with plans, actors of the descriptions, for the tasks that were demonstrated
-    target: Execution | None = None  # how a target task is demonstrated, once, where the setting has targets
-    after_success: int | None = None  # drop what comes so many steps after the first success; None keeps all
-    passes: int | None = None  # train for so many passes over the rows instead of ``training.steps`` minibatches
-    evaluations: int = 1  # of the policy, a 25th of the training apart, the last at its end; of one member, if several
+    ] = ()  # for methods with plans: description-conditioned actors for demonstrated tasks
+    target: Execution | None = None  # how an expert demonstrates a target task once, if the setting has targets
+    after_success: int | None = None  # drop rows more than N steps after the first success; None keeps all rows
+    passes: int | None = None  # number of passes over the rows, instead of ``training.steps`` minibatches
+    evaluations: int = 1  # number of evaluations, a 25th of the training apart, the last at the end
 
     def __post_init__(self) -> None:
         if self.evaluations > 1 and len(self.members) > 1:
-            raise ValueError(f"evaluations must be 1 of {len(self.members)} members, got {self.evaluations}")
+            raise ValueError(f"evaluations must be 1 with {len(self.members)} members, got {self.evaluations}")
 
     def evaluated_before(self, steps: int) -> list[int]:
-        """The steps after which a policy is evaluated before its training ends."""
+        """Return the steps after which to evaluate a policy before its training ends."""
         return sorted({steps - k * steps // 25 for k in range(1, self.evaluations)} - {steps})
 
 
@@ -86,7 +86,7 @@ def _tuples(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _preset(name: str, every: Mapping[str, Any], own: Mapping[str, Any]) -> Preset:
-    """A preset in a setting, whose ``own`` table adds to the one of ``every`` setting."""
+    """Return a preset for a setting, whose ``own`` table extends the table for ``every`` setting."""
     given = {"name": name, **every, **own}
     given |= {key: EXECUTIONS[given[key]] for key in ("base", "target") if key in given}
     for field_name in ("members", "demonstrated"):
@@ -105,59 +105,59 @@ PRESETS: Mapping[str, Mapping[str, Preset]] = MappingProxyType(
         for name, settings in _TABLE["presets"].items()
     }
 )
-"""Preset's name, then setting's name, to :class:`Preset`."""
+"""The presets by name, then by the setting's name."""
 
 
 @dataclass(frozen=True)
 class Portion:
-    """Episodes of one behaviour."""
+    """A portion of a mixture: a number of episodes of one behaviour."""
 
     behaviour: str  # a name of :data:`BEHAVIOURS`
-    episodes: int  # of each task
+    episodes: int  # number of episodes per task
 
 
 @dataclass(frozen=True)
 class OfflineMethod:
-    """How a policy is learned from a mixture."""
+    """A method to learn a policy from a mixture."""
 
-    name: str  # in folders and tables
+    name: str  # the method's name in folders and tables
     loss: str  # a name of :data:`benchmarks.paper.offline.DISTRIBUTIONS`
-    keep: EpisodeFilter | None = None  # which episodes it sees; None for all
-    critic: bool = False  # whether it has a critic, which may be conditioned otherwise than the actor
-    version: int = 1  # raised by 1 whenever the method changes, so that earlier results are refused
+    keep: EpisodeFilter | None = None  # the episodes to learn from; None for all
+    critic: bool = False  # whether there is a critic, whose conditioning may differ from the actor's
+    version: int = 1  # increased by 1 whenever the method changes, so that earlier results are rejected
 
 
 @typed_fields
 @dataclass(frozen=True)
 class OfflineRecipe:
-    """The numbers of all methods."""
+    """The hyperparameters of all methods."""
 
-    reward: RewardName = "dense_cost"  # what values are of
-    n_steps: Count = 10  # of the values' targets
-    gamma: Probability = 0.99  # of these
-    expectile: Probability = 0.7  # of the value
-    beta: Scale = 2.0  # of the weights by advantage, as for :class:`AdvantageWeightedLoss`
-    max_weight: Scale = 20.0  # of these
-    distance: Literal["l1", "l2"] = "l1"  # to what is imitated; the mean of open and close would half open the gripper
-    temperature: Scale = 3.0  # of IQL's actor
-    alpha: Scale = 2.5  # of TD3+BC, the weight of the value beside the imitation
-    alpha_l1: Scale = 1.0  # of TD3+BC and CQL with imitation by l1, the weight of values in deviations of their task
-    cql_weight: Scale = 1.0  # of CQL's penalty
-    steps: Count = 4000  # minibatches of every actor; of the value, ``value_steps``
+    reward: RewardName = "dense_cost"  # reward for learning values
+    n_steps: Count = 10  # number of time steps in value targets
+    gamma: Probability = 0.99  # discount factor of value targets
+    expectile: Probability = 0.7  # expectile of the value
+    beta: Scale = 2.0  # inverse temperature of the advantage weights, see :class:`AdvantageWeightedLoss`
+    max_weight: Scale = 20.0  # maximum advantage weight
+    distance: Literal["l1", "l2"] = "l1"  # imitation distance; l2 averages open and close to a half-open gripper
+    temperature: Scale = 3.0  # inverse temperature of IQL's actor
+    alpha: Scale = 2.5  # weight of the value in TD3+BC
+    alpha_l1: Scale = 1.0  # weight of standardized values in TD3+BC and CQL with l1 imitation
+    cql_weight: Scale = 1.0  # weight of CQL's penalty
+    steps: Count = 4000  # minibatches for each actor; ``value_steps`` is for the value
     value_steps: Count = 4000
-    batch_size: Count = 250  # rows of one
-    width: Count = 256  # of hidden layers
-    depth: Count = 3  # of actors
+    batch_size: Count = 250  # rows per minibatch
+    width: Count = 256  # units per hidden layer
+    depth: Count = 3  # hidden layers of actors
     critic_depth: Count = 2
-    feature_noise: Scale = 0.05  # of actors while they train
+    feature_noise: Scale = 0.05  # feature noise of actors during training
 
 
 @dataclass(frozen=True)
 class OfflineTable:
-    """Runs that are compared: the first row of a mixture with each of the others."""
+    """A table of runs, in which the first row of a mixture is compared with each of the others."""
 
     tasks: str  # a name of :data:`TASK_SETS`
-    rows: Mapping[str, tuple[tuple[str, str, str], ...]]  # mixture to its rows, (method, actor, critic) each
+    rows: Mapping[str, tuple[tuple[str, str, str], ...]]  # the rows (method, actor, critic) of each mixture
 
 
 def _table(tasks: str, runs: Sequence[Mapping[str, Any]]) -> OfflineTable:

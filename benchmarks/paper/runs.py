@@ -1,4 +1,4 @@
-"""Runs: what every run of an experiment is, how it is executed, and how results are compared."""
+"""Base classes of the datasets and runs of an experiment, and the function that executes a run."""
 
 import json
 import time
@@ -23,13 +23,13 @@ from lw_torchrl.training import load_actor, save_actor
 from lw_torchrl.training.checkpoint import check_description, training_file
 from lw_torchrl.training.minibatches import describe_data
 
-EVALUATION_SEED = 10_000  # training seeds count from 0; the evaluation of training seed k has seed 10000 + k
+EVALUATION_SEED = 10_000  # the policy of training seed k is evaluated with seed 10000 + k
 RESULTS = "results.json"
 
 
 @dataclass(frozen=True)
 class Work:
-    """With what a run is executed: the arguments of :func:`execute_run`, checked."""
+    """The checked arguments of :func:`execute_run`."""
 
     plans: Plans
     out: Path
@@ -39,67 +39,67 @@ class Work:
 
 
 class Dataset(ABC):
-    """Episodes that runs share."""
+    """A base class of datasets that several runs share."""
 
     @property
     @abstractmethod
     def folder(self) -> Path:
-        """Where it goes, below the experiments' folder."""
+        """The dataset's folder, relative to the experiments' folder."""
 
     @property
     @abstractmethod
     def options(self) -> dict[str, Any]:
-        """Of :func:`~lw_torchrl.collect_demonstrations`."""
+        """Return the arguments of :func:`~lw_torchrl.collect_demonstrations`."""
 
     def collect(self, out: Path, progress: bool) -> None:
-        """Collect it, or what is left; of several processes one does, and the others wait."""
+        """Collect the dataset, or the missing part of it. If several processes call this, one collects, others wait."""
         root = out / self.folder
         with locked(root, "out", wait=True):
             collect_demonstrations(**self.options, root=root, progress=progress)
 
 
 class Run(ABC):
-    """Policies of one training seed, and their evaluation: what a scheduler runs."""
+    """A base class of runs: the training of policies with one seed, and their evaluation."""
 
     method: str
-    seed: int  # of data, initial weights and minibatches
-    episodes: int  # evaluated for each task
-    any_device = False  # whether its networks can be trained and evaluated on a GPU
+    seed: int  # seed of data, initial weights and minibatches
+    episodes: int  # evaluation episodes per task
+    any_device = False  # whether networks can be trained and evaluated on a GPU
 
     @property
     @abstractmethod
     def folder(self) -> Path:
-        """Where its files go, below the experiments' folder."""
+        """The run's folder, relative to the experiments' folder."""
 
     @property
     def label(self) -> str:
-        """Its name in tables."""
+        """The run's name in tables."""
         return self.method
 
     @property
     @abstractmethod
     def datasets(self) -> tuple[Dataset, ...]:
-        """What it learns from."""
+        """The datasets from which the run learns."""
 
     @property
     @abstractmethod
     def scope(self) -> str | tuple[str, ...]:
-        """The tasks that it can be evaluated in, as for :func:`resolve_tasks`."""
+        """The tasks on which the run can be evaluated, as for :func:`resolve_tasks`."""
 
     @abstractmethod
     def describe(self, plans: Plans) -> dict[str, Any]:
-        """Everything that its result depends on, as JSON."""
+        """Return everything on which the result depends, as JSON."""
 
     @abstractmethod
     def learn(self, work: Work) -> tuple[Any, dict[str, Any]]:
-        """The trained policy, or what the files there hold of it, and what the result says of the training."""
+        """Train the policy, or load it from existing files; return it with an entry for the result's config."""
 
     def evaluate(self, policy: Any, work: Work) -> tuple[EvaluationResult, dict[str, Any]]:
-        """The evaluation of what was learned, and what the result says of it."""
+        """Evaluate the policy; return the result with an entry for its config."""
         return self.rollouts(policy, work), {}
 
     def evaluated(self, tasks: str | Sequence[str] | None) -> tuple[str, ...]:
-        """Those of its tasks that are among the ones named; None for all."""
+        """Return the run's tasks that are among ``tasks``, or all for None; raise ValueError if there are none."""
         own = tuple(find_suite(self.scope).named_tasks(self.scope))
         names = own if tasks is None else tuple(find_suite(tasks).named_tasks(tasks))
         if not (shown := tuple(name for name in names if name in own)):
@@ -107,7 +107,7 @@ class Run(ABC):
         return shown
 
     def rollouts(self, policy: Any, work: Work, **options: Any) -> EvaluationResult:
-        """Evaluate one policy, as all runs do: fresh seeds, action noise 0.1."""
+        """Evaluate a policy as in all runs, with fresh seeds and action noise 0.1."""
         given: dict[str, Any] = {"tasks": work.tasks, "episodes_per_task": self.episodes, "progress": work.progress}
         given |= {"seed": EVALUATION_SEED + self.seed, "noise_scale": 0.1, "stop_at_success": True}
         return evaluate(policy, **given | options)
@@ -116,7 +116,7 @@ class Run(ABC):
 def load_result(
     run: Run, plans: Plans, out: Path, tasks: Sequence[str] | None = None, file: str = RESULTS
 ) -> EvaluationResult | None:
-    """The result of a run, if it is there; one of another configuration, or of other tasks, is refused."""
+    """Return the result of a run, or None if it does not exist; raise ValueError if its config or tasks differ."""
     path = out / run.folder / file
     if not path.is_file():
         return None
@@ -126,9 +126,9 @@ def load_result(
     if tasks is not None:
         found, ours = found | {"tasks": result.config["tasks"]}, ours | {"tasks": [*tasks]}
     if different := differences(found, ours):
-        mend = f"choose another folder, or delete {run.folder} there to do the run again"
-        how = f"it differs in {', '.join(different)}"
-        raise ValueError(f"out: {str(path)!r} is of another configuration, {how}; {mend}")
+        mend = f"choose another folder, or delete {run.folder} in it to repeat the run"
+        how = f"which differs in {', '.join(different)}"
+        raise ValueError(f"out: {str(path)!r} has a different configuration, {how}; {mend}")
     return result
 
 
@@ -141,15 +141,15 @@ def execute_run(
     progress: bool = True,
     device: str | torch.device = "cpu",
 ) -> EvaluationResult:
-    """Execute a run, or the rest of it, and return its evaluation. Its result is written last, to results.json.
+    """Execute a run, or the remaining part of it, and return the evaluation, which is also written to results.json.
 
     Args:
         run: the run.
-        plans: a plan for each of its tasks.
+        plans: a plan for each of the run's tasks.
         out: the experiments' folder.
         tasks: the tasks to evaluate; None for all of the run.
         progress: show progress bars.
-        device: device of the networks, for runs that support others than the CPU.
+        device: device of the networks; some runs support only the CPU.
 
     Returns:
         The evaluation of the last step's policy on seeds that no training used, with action noise 0.1.
@@ -184,26 +184,26 @@ def execute_run(
 def kept_policy(
     file: Path, described: dict[str, Any], train: Callable[[Path], Mapping[str, Any]]
 ) -> TensorDictModuleBase:
-    """The policy of a file, which must say what is ``described``; if there is none, it is trained and saved first.
+    """Load a policy from a file whose description must equal ``described``; train and save it first if needed.
 
-    ``train`` is given the checkpoint to use meanwhile; it returns arguments of :func:`~lw_torchrl.save_actor`.
+    ``train`` gets the path of a checkpoint for the training, and returns arguments of :func:`~lw_torchrl.save_actor`.
     """
     checkpoint = file.with_name("checkpoint.safetensors")
     if not file.is_file():
         trained = dict(train(checkpoint))
         save_actor(trained.pop("actor"), file, data=describe_data(trained.pop("replay")), **trained, **described)
     for written in (checkpoint, training_file(checkpoint)):
-        written.unlink(missing_ok=True)  # another process may have done so, where files cannot be locked
+        written.unlink(missing_ok=True)  # without file locks, another process may have removed it
     check_description(file, described)
     return load_actor(file)
 
 
 def own_tasks(plans: Plans) -> dict[str, Any]:
-    """The tasks of plans that are not ours of that name: no plan's fingerprint says what a description says."""
+    """Return the tasks that differ from the shipped ones, because fingerprints of plans do not cover descriptions."""
     own = {task: plan.definition.to_json() for task, plan in plans.items() if plan.definition != TASKS.get(task)}
     return {"own_tasks": own} if own else {}
 
 
 def plain(value: Any) -> Any:
-    """As JSON gives it back: lists for tuples."""
+    """Convert a value to JSON and back, which turns tuples into lists."""
     return json.loads(json.dumps(value))

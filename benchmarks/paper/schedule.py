@@ -19,29 +19,30 @@ from lw_torchrl._util.checks import check_choice
 from lw_torchrl.evaluation import EvaluationResult
 
 Job = Callable[[], Any]
-"""Executes a run and returns its :class:`EvaluationResult`, or makes data that several runs share."""
+"""A function that executes a run and returns its :class:`EvaluationResult`, or makes data that several runs share."""
 Launcher = Literal["local", "ray"]
 ROOT = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """Options of every experiment."""
+    """Options that all experiments share."""
 
     out: Path
-    """Folder for all results. Stopped and started again, the command resumes there."""
+    """Folder for all results. If the command is stopped, run it again to resume."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Training seeds: of the data, the initial weights and the minibatches."""
+    """Random seeds of the data, the initial weights and the minibatches."""
     episodes: int = 20
-    """Evaluation episodes per task, on seeds that no training used, with action noise 0.1."""
+    """Number of evaluation episodes per task, on seeds that no training used, with action noise 0.1."""
     list: bool = False
     """Print the names of the runs and stop."""
     run: str | None = None
-    """Execute only this run, of the names that --list prints."""
+    """Execute only the run with this name (see --list)."""
     jobs: int = 1
-    """Number of runs at a time, with the launcher local."""
+    """Number of simultaneous runs with --launcher local."""
     launcher: Launcher = "local"
-    """local: processes on this machine. ray: a Ray cluster whose machines share --out, or all cores of this machine."""
+    """Where to execute runs: local (processes on this machine), or ray (a Ray cluster whose machines share --out, or
+    all cores of this machine)."""
 
 
 def execute(
@@ -51,14 +52,14 @@ def execute(
     runs: Mapping[str, Job],
     summarize: Callable[[], None],
 ) -> None:
-    """Execute all runs and write the summary, or do what ``--list`` or ``--run`` says.
+    """Execute all runs and write the summary; with ``--list``, print the runs; with ``--run``, execute a single run.
 
     Args:
         schedule: which runs to execute, and where.
         arguments: the command line; other processes get it with ``--run NAME`` added.
-        shared: stages of jobs, by name, whose data the runs share. A run makes what is missing itself.
+        shared: stages of jobs, by name, that make data for several runs. A run makes missing data itself.
         runs: the runs by name.
-        summarize: writes the summary; called after all runs.
+        summarize: a function that writes the summary, called after all runs.
     """
     jobs = {name: job for stage in (*shared, runs) for name, job in stage.items()}
     if schedule.list:
@@ -86,7 +87,7 @@ def execute(
 
 
 def _report(total: int, lines: Iterator[str]) -> None:
-    """Print the line of each run when it ends, and an estimate of the remaining time."""
+    """Print a line when a run ends, with an estimate of the remaining time."""
     started = time.perf_counter()
     for number, line in enumerate(lines, 1):
         left = (time.perf_counter() - started) / number * (total - number)
@@ -105,7 +106,7 @@ def run_command(arguments: Sequence[str]) -> str:
 
 
 def run_commands(commands: Sequence[Sequence[str]], launcher: Launcher, jobs: int) -> Iterator[tuple[int, str]]:
-    """Run commands; yield the index and output of each when it ends. An error is raised after the others have ended."""
+    """Run commands; yield the index and output of each when it ends. If one fails, raise an error at the end."""
     failed: Exception | None = None
     for index, outcome in _local(commands, jobs) if launcher == "local" else _ray(commands):
         if isinstance(outcome, Exception):

@@ -1,4 +1,4 @@
-"""StackedBehavioralCloning: many actors of one architecture trained at once, their parameters stacked."""
+"""StackedBehavioralCloning: train many actors with the same architecture at once, with stacked parameters."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lw_torchrl.training.normalization import check_contacts, fit_normalization,
 from lw_torchrl.transforms import FallbackTurns, JitterTarget, QAFTransform, RandomYaw
 
 _BY_ROW = (FallbackTurns, JitterTarget, QAFTransform, RandomYaw)
-"""Transforms that compute each row from this row alone."""
+"""Transforms that compute each row independently of other rows."""
 
 
 def _check_actors(actors: Sequence[TensorDictModuleBase]) -> None:
@@ -34,7 +34,7 @@ def _check_actors(actors: Sequence[TensorDictModuleBase]) -> None:
     for number, other in enumerate(others, 1):
         if different := differences(first, other):
             raise ValueError(
-                f"actors must have the same parts and plans, 0 and {number} differ in {', '.join(different)}"
+                f"actors must have the same parts and plans; actors 0 and {number} differ in {', '.join(different)}"
             )
     weights = [id(parameter) for actor in actors for parameter in actor.parameters()]
     if len({*weights}) < len(weights):
@@ -42,21 +42,21 @@ def _check_actors(actors: Sequence[TensorDictModuleBase]) -> None:
 
 
 class StackedBehavioralCloning(Training):
-    """Train M actors, each on its own batches, as :class:`BehavioralCloningTrainer` trains one.
+    """A trainer of M actors, each on its own minibatches, as :class:`BehavioralCloningTrainer` trains one actor.
 
-    One ``vmap`` computes all M actors. Each actor has the batches and augmentations that its seed gives it alone, so
-    that its losses are those it would have alone, up to rounding and the features' noise; on a GPU, augmentations of
-    all actors draw from one seed.
+    One ``vmap`` computes all M actors. The minibatches and augmentations of an actor depend only on its own seed, so
+    its losses are the same as when it is trained alone, up to rounding and feature noise. On a GPU, the augmentations
+    of all actors share one seed.
 
     Args:
         actors: M policies with the same parts and plans and with their own weights, trained in place.
-        replays: M buffers, each with its own sampler; the i-th actor's batches come from the i-th.
-        config: how to train each; the i-th has the seed ``config.seed + i``.
-        device: where to train, as for :class:`BehavioralCloningTrainer`; None for where the first actor is.
-        **options: of :class:`~lw_torchrl.training.loop.Training`, with its errors.
+        replays: M buffers, each with its own sampler; actor i learns from buffer i.
+        config: the hyperparameters of all actors; actor i has the seed ``config.seed + i``.
+        device: the device to train on, as for :class:`BehavioralCloningTrainer`; None for the first actor's device.
+        **options: keyword arguments of :class:`~lw_torchrl.training.loop.Training`, which also lists their errors.
 
     Raises:
-        ValueError: the numbers of buffers and actors differ, one of them stands twice, or the actors' parts differ.
+        ValueError: the numbers of buffers and actors differ, one is repeated, or the actors' parts differ.
 
     Source: paper section 'Conditional Plan Experiments', which trains 50 one-shot models; ``torch.func``.
     """
@@ -73,7 +73,10 @@ class StackedBehavioralCloning(Training):
     ) -> None:
         config = config or BehavioralCloningConfig()
         if not actors or len(replays) != len(actors):
-            raise ValueError(f"replays must be as many as actors, at least one, got {len(replays)} and {len(actors)}")
+            raise ValueError(
+                f"replays must have one buffer for each of the actors, at least one, got {len(replays)} buffers for "
+                f"{len(actors)} actors"
+            )
         options.setdefault("title", f"training {len(actors)} models")
         options.setdefault("capture", True)
         super().__init__(config, **options)
@@ -81,7 +84,7 @@ class StackedBehavioralCloning(Training):
         self.module, self.networks = actors[0], [*actors]
         _check_actors(actors)
         if len({*map(id, replays)}) < len(replays) or len({id(one.sampler) for one in replays}) < len(replays):
-            raise ValueError("replays must be different buffers, each with a sampler of its own")
+            raise ValueError("replays must be different buffers with different samplers")
         if config.qaf_anchor:
             raise ValueError("qaf_anchor is for BehavioralCloningTrainer, which trains one policy at a time")
         self.device = place(actors[0], device)
@@ -103,7 +106,7 @@ class StackedBehavioralCloning(Training):
                 check_contacts(actor)
             actor.train()
         parameters, buffers = stack_module_state([*actors])  # type: ignore[arg-type]
-        # All actors have the same tables of their plans, which are no part of the state.
+        # All actors have the same plan tables, which are not part of the state.
         self._buffers = {name: value for name, value in buffers.items() if name in actors[0].state_dict()}
         self._parameters = {name: nn.Parameter(value.detach()) for name, value in parameters.items()}
         self._act = vmap(
@@ -132,7 +135,7 @@ class StackedBehavioralCloning(Training):
             return torch.stack([source.rows(own).exclude("next") for source, own in pairs])
         rows = torch.stack([source.stored(own) for source, own in pairs])
         for parts in zip(*(source.replay.transform for source in sources), strict=True):
-            if isinstance(parts[0], _BY_ROW):  # in one call for all models, which a GPU computes as fast as one
+            if isinstance(parts[0], _BY_ROW):  # one call for all models takes a GPU as long as one model
                 rows = parts[0](rows)
             else:
                 rows = torch.stack([part(own) for part, own in zip(parts, rows.unbind(0), strict=True)])
@@ -151,7 +154,7 @@ class StackedBehavioralCloning(Training):
             gradient.mul_(factor.reshape(-1, *[1] * (gradient.ndim - 1)))
 
     def train(self, until: int | None = None) -> Tensor:  # type: ignore[override]
-        """Train to the last step and give the actors their weights; Ctrl-C as in :class:`BehavioralCloningTrainer`.
+        """Train to the last step and copy the weights to the actors; Ctrl-C as in :class:`BehavioralCloningTrainer`.
 
         Returns:
             (M,) float32, each actor's mean loss over the latest 100 steps; NaN if there were none left.

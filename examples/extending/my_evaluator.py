@@ -1,4 +1,4 @@
-"""A custom query evaluator: conditions are soft near their thresholds, and how soft is learned.
+"""A custom query evaluator: truth values are soft near the thresholds of conditions, with a learned temperature.
 
 lw-torchrl collect reach window-open --episodes 2 --out demos
 lw-torchrl train demos --out policy.safetensors --steps 300 --evaluator my_evaluator:SoftTruth
@@ -14,7 +14,7 @@ import lw_torchrl as lw
 class SoftTruth(lw.QueryEvaluator):
     def __init__(self, plans, temperature=1.0, **options):
         super().__init__(plans, **options)
-        self.config = {**self.config, "temperature": temperature}  # what a file needs, besides the plans
+        self.config = {**self.config, "temperature": temperature}  # arguments to rebuild the module from a file
         conditions = {plan.definition: [step.condition for step in plan.steps] for plan in plans.values()}
         self.program = lw.QueryProgram(conditions)
         self.scale = nn.Parameter(torch.tensor(temperature).log())

@@ -1,4 +1,4 @@
-"""A plan format of your own: how plans are written, asked of a language model, and read from its answer.
+"""A custom plan format: how to write plans, prompt a language model for them, and parse the model's answer.
 
 lw-torchrl plan prompt drawer-open --format arrows --import my_format
 lw-torchrl plan read answer.txt --task drawer-open --format arrows --import my_format
@@ -12,7 +12,7 @@ def encode(plan):
     return "".join(f"{step.condition} -> {step.skill}\n" for step in plan.steps)
 
 
-def read(text):  # of any text, since models write anything; it never raises
+def read(text):  # must not raise for any text, because models can answer anything
     found = Reading()
     for number, line in enumerate(text.splitlines(), 1):
         condition, arrow, skill = line.partition("->")
@@ -23,9 +23,9 @@ def read(text):  # of any text, since models write anything; it never raises
     return found
 
 
-def prompt(examples, task, hints):  # other tasks' plans, the task, and lines that say what can be asked
+def prompt(examples, task, hints):  # plans of other tasks, the task, and lines that describe the possible conditions
     shown = [f"{plan.definition.description}\n{encode(plan)}" for plan in examples]
-    return "\n".join(["Plans, a line for each step: condition -> skill.\n", *shown, *hints, task.description, ""])
+    return "\n".join(["Plans with one line per step: condition -> skill.\n", *shown, *hints, task.description, ""])
 
 
 lw.PLAN_FORMATS["arrows"] = PlanFormat("txt", encode, read, prompt)

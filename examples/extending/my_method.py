@@ -1,4 +1,4 @@
-"""A custom method: each task has a vector that is learned, and no words are read.
+"""A custom method: condition the policy on a learned vector for each task, without any text.
 
 lw-torchrl collect reach window-open --episodes 2 --out demos
 lw-torchrl train demos --out policy.safetensors --steps 300 --method task-vectors --import my_method
@@ -17,7 +17,7 @@ from lw_torchrl.modules import METHODS, ConditionedActor, ObservationFeatures
 class TaskVectors(TensorDictModuleBase):
     def __init__(self, task_ids, size=16):
         super().__init__()
-        self.config = {"task_ids": dict(task_ids), "size": size}  # what a file needs to build it again
+        self.config = {"task_ids": dict(task_ids), "size": size}  # arguments to rebuild the module from a file
         self.in_keys, self.out_keys = ["task_id"], ["task_latent"]
         self.tasks, self.latent_size = tuple(task_ids), size
         self.index = TaskIndex(task_ids)

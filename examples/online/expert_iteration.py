@@ -1,7 +1,7 @@
-"""Expert iteration: clone a policy from one demonstration, then again and again from its own successes.
+"""Expert iteration: clone a policy from one demonstration, then repeatedly from its own successes.
 
-A round is one episode or more of each environment. Successful episodes join the demonstrations, and each minibatch is
-half demonstrations, half successes. Exploration noise is small, and grows where the plan makes no progress.
+In each round, every environment runs one or more episodes. Successful episodes are added to the buffer, and each
+minibatch is half demonstrations, half successes. Exploration noise grows while the plan makes no progress.
 
 python examples/online/expert_iteration.py --task hammer   # 60,000 steps: about 4 minutes on one core
 """
@@ -27,7 +27,7 @@ import lw_torchrl as lw
 @dataclass
 class Args:
     task: str = "hammer"
-    seed: int = 0  # demonstrations have this seed, training episodes 20,000 more, evaluation episodes 10,000 more
+    seed: int = 0  # seed of the demonstrations; training episodes use seed + 20,000, evaluation seed + 10,000
     start: Path | None = None  # policy file to start from; by default, clone one from the demonstrations
     out: Path = Path("runs/expert_iteration")  # demonstrations and the trained policy
     demonstrations: int = 1  # episodes of the scripted expert
@@ -40,14 +40,14 @@ class Args:
     batch_size: int = 200
     learning_rate: float = 3e-4
     noise: float = 0.05  # standard deviation of the exploration noise
-    stuck_noise: float = 0.5  # on the hand, where the plan makes no progress
+    stuck_noise: float = 0.5  # standard deviation of the hand's noise while the plan makes no progress
     noise_hold: int = 5  # steps for which each draw of the noise is kept
     episodes: int = 40  # evaluation episodes
 
 
 class PlanNoise(TensorDictModuleBase):
-    """Add exploration noise that grows from ``noise`` to ``stuck_noise`` where the plan makes no progress: no condition
-    has changed its truth value for longer than in any demonstration. The gripper's noise stays small, for grasps."""
+    """Add exploration noise that grows from ``noise`` to ``stuck_noise`` while the plan makes no progress, which means
+    that all truth values have been constant for longer than in any demonstration. Noise on the gripper stays small."""
 
     in_keys, out_keys = ["action", "qaf", "is_init"], ["action"]
 
@@ -76,7 +76,7 @@ def main(args: Args) -> None:
     options = {"episodes_per_task": args.demonstrations, "seed": args.seed, "redraw_failures": True}
     lw.collect_demonstrations(args.task, root=demos, **options)
 
-    # The start: behavioral cloning of the demonstrations.
+    # Start with behavioral cloning of the demonstrations.
     plans = lw.Plans([lw.load_plans("MT50")[args.task]])
     features = lw.modules.ObservationFeatures(noise=0.1)
     actor = lw.load_actor(args.start) if args.start else lw.PlanConditionedActor(plans, features=features)
@@ -93,9 +93,9 @@ def main(args: Args) -> None:
     offline = lw.LanguageWorldExperienceReplay(demos, **options)
     replay = OfflineToOnlineReplayBuffer(offline, online_capacity=args.frames, batch_size=args.batch_size)
     keys = list(offline.sample(1).keys())
-    warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # a warning of BCLoss about itself
-    loss = BCLoss(actor.train(), loss_function="l1")  # learns in train mode, with noise on the features
-    actor.eval()  # and acts without
+    warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss's own, irrelevant warning
+    loss = BCLoss(actor.train(), loss_function="l1")  # the loss uses train mode, with noise on the features
+    actor.eval()  # the collector acts in eval mode, without this noise
     optimizer = torch.optim.AdamW(loss.parameters(), lr=args.learning_rate)
 
     episodes = {"max_steps": args.max_steps, "terminate_on_success": True, "seed": 20_000 + args.seed}
@@ -103,7 +103,7 @@ def main(args: Args) -> None:
     collector = Collector(
         TransformedEnv(env, Compose(lw.QAFTransform(actor.plans), InitTracker())),
         TensorDictSequential(actor, PlanNoise(args, demonstrations[:])),
-        frames_per_batch=args.max_steps * args.num_envs,  # a round
+        frames_per_batch=args.max_steps * args.num_envs,  # one round
         total_frames=args.frames,
         reset_at_each_iter=True,
         auto_register_policy_transforms=False,
@@ -118,7 +118,7 @@ def main(args: Args) -> None:
         if successful.any():
             replay.extend(rows[successful].select(*keys))
         due = int(max(0, frames - args.learning_starts) * args.utd)
-        if len(replay) == len(demonstrations):  # no success yet to learn from
+        if len(replay) == len(demonstrations):  # no episode has succeeded yet
             step = due
         while step < due and not stop.is_set():
             bc_loss = loss(replay.sample())["loss_bc"]

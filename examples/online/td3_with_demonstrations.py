@@ -1,7 +1,7 @@
 """TD3 with demonstrations: clone a policy from one demonstration, then improve it in its environment.
 
-Each minibatch is half demonstrations, half rows of the collector. The critics learn from both halves; the actor follows
-the critics and imitates the demonstrated half. Exploration noise is small, and grows where the plan makes no progress.
+Each minibatch is half demonstrations, half collected rows. The critics learn from both halves. The actor maximizes the
+critics' value on both, and imitates the demonstrated half. Exploration noise grows while the plan makes no progress.
 
 python examples/online/td3_with_demonstrations.py --task hammer   # 60,000 steps: about 10 minutes on one core
 """
@@ -28,36 +28,36 @@ from lw_torchrl.training import fit_normalization
 @dataclass
 class Args:
     task: str = "hammer"
-    seed: int = 0  # demonstrations have this seed, training episodes 20,000 more, evaluation episodes 10,000 more
+    seed: int = 0  # seed of the demonstrations; training episodes use seed + 20,000, evaluation seed + 10,000
     start: Path | None = None  # policy file to start from; by default, clone one from the demonstrations
     out: Path = Path("runs/td3_with_demonstrations")  # demonstrations and the trained policy
     demonstrations: int = 1  # episodes of the scripted expert
     cloning_steps: int = 1_500  # minibatches of behavioral cloning
     frames: int = 60_000  # environment steps
     num_envs: int = 20
-    rollout: int = 25  # steps of each environment in a batch, at whose end the n-step return is cut
+    rollout: int = 25  # steps of each environment in a batch; n-step returns stop at the end of a batch
     max_steps: int = 250  # steps per episode
     learning_starts: int = 1_000  # environment steps before the first gradient step
     utd: float = 0.4  # gradient steps per environment step
     critic_warm_up: int = 2_000  # gradient steps in which only the critics learn
     batch_size: int = 200
     gamma: float = 0.99
-    n_steps: int = 5  # of the n-step return
+    n_steps: int = 5  # number of steps in an n-step return
     actor_lr: float = 1e-4
     critic_lr: float = 5e-4
     bc_weight: float = 2.0  # weight of the imitation loss
     policy_delay: int = 2  # critic updates per actor update
-    policy_noise: float = 0.1  # on the target action
+    policy_noise: float = 0.1  # standard deviation of the noise on the target action
     noise_clip: float = 0.3
     noise: float = 0.05  # standard deviation of the exploration noise
-    stuck_noise: float = 0.5  # on the hand, where the plan makes no progress
+    stuck_noise: float = 0.5  # standard deviation of the hand's noise while the plan makes no progress
     noise_hold: int = 5  # steps for which each draw of the noise is kept
     episodes: int = 40  # evaluation episodes
 
 
 class PlanNoise(TensorDictModuleBase):
-    """Add exploration noise that grows from ``noise`` to ``stuck_noise`` where the plan makes no progress: no condition
-    has changed its truth value for longer than in any demonstration. The gripper's noise stays small, for grasps."""
+    """Add exploration noise that grows from ``noise`` to ``stuck_noise`` while the plan makes no progress, which means
+    that all truth values have been constant for longer than in any demonstration. Noise on the gripper stays small."""
 
     in_keys, out_keys = ["action", "qaf", "is_init"], ["action"]
 
@@ -92,7 +92,7 @@ def main(args: Args) -> None:
     options = {"episodes_per_task": args.demonstrations, "seed": args.seed, "redraw_failures": True}
     lw.collect_demonstrations(args.task, root=demos, **options)
 
-    # The start: behavioral cloning of the demonstrations.
+    # Start with behavioral cloning of the demonstrations.
     plans = lw.Plans([lw.load_plans("MT50")[args.task]])
     features = lw.modules.ObservationFeatures(noise=0.1)
     actor = lw.load_actor(args.start) if args.start else lw.PlanConditionedActor(plans, features=features)
@@ -103,7 +103,7 @@ def main(args: Args) -> None:
         lw.BehavioralCloningTrainer(actor, demonstrations, config).train()
     actor.eval()
 
-    # Half of each minibatch are demonstrations, half the collector's rows; the reward is a cost until success.
+    # Half of each minibatch is demonstrations, half collected rows. The reward is a cost per step until success.
     torch.manual_seed(20_000 + args.seed)
     options |= {"reward": "dense_cost", "n_steps": args.n_steps, "gamma": args.gamma}
     options |= {"keys": [*ROLLOUT, "steps_to_next_obs", "is_demonstration"], "transform": lw.QAFTransform(actor.plans)}

@@ -1,4 +1,4 @@
-"""A custom decoder: any module from latent and features to an action. It is saved, and loaded in a new process."""
+"""A custom decoder: any module that maps latent and features to an action. A saved policy contains the decoder."""
 
 import torch
 
@@ -8,7 +8,7 @@ from lw_torchrl import PlanConditionedActor, load_actor, load_plans, save_actor
 class Decoder(torch.nn.Sequential):
     def __init__(self, width: int = 64) -> None:
         super().__init__(torch.nn.LazyLinear(width), torch.nn.GELU(), torch.nn.Linear(width, 4), torch.nn.Tanh())
-        self.config = {"width": width}  # what a file needs to build it again
+        self.config = {"width": width}  # arguments to rebuild the module from a file
 
 
 save_actor(PlanConditionedActor(load_plans("MT10"), decoder=Decoder(width=32)), "custom_decoder.safetensors")

@@ -1,4 +1,4 @@
-"""A custom skill encoder: any module from the K skills' text vectors (K, 384) to latents (K, D)."""
+"""A custom skill encoder: any module that maps the embeddings of K skill texts (K, 384) to latents (K, D)."""
 
 import torch
 from torchrl.envs import TransformedEnv

@@ -1,4 +1,4 @@
-"""A learned evaluator in front of a policy: it answers the conditions, and one loss trains both."""
+"""A policy with a learned evaluator, which answers the plan's conditions; one loss trains both modules."""
 
 from tensordict.nn import TensorDictSequential
 

@@ -1,4 +1,4 @@
-"""PlanAttention on a tensor: the attention over a plan's steps when only its second condition is true."""
+"""PlanAttention on a tensor: the attention over a plan's steps if only the second step's condition is true."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""QAFTransform on another library's environment: the truth of conditions in Meta-World's own gymnasium environment."""
+"""QAFTransform on another environment: check the plan's conditions in Meta-World's own gymnasium environment."""
 
 import gymnasium
 import metaworld  # noqa: F401 - registers the environments

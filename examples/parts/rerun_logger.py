@@ -1,4 +1,4 @@
-"""RerunLogger on a TorchRL environment that is not ours: a recording of a pendulum's tip."""
+"""RerunLogger on one of TorchRL's environments: record the tip of a pendulum."""
 
 import torch
 from torchrl.envs import PendulumEnv

@@ -1,4 +1,4 @@
-"""The samplers on a plain TorchRL buffer: equally many rows of each task, or half of a target task."""
+"""The samplers on a TorchRL buffer: draw equally many rows of each task, or half of the rows of a target task."""
 
 import torch
 from tensordict import TensorDict

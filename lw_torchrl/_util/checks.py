@@ -64,9 +64,9 @@ def typed(function: Function) -> Function:
     """Decorate a function to check arguments against their annotations, and raise an :class:`ArgumentError` for the
     first invalid argument.
 
-    NumPy scalars are converted to Python numbers. Annotations are evaluated at the first call, so all names in them
-    must be imported at run time: an argument whose type is imported only for type checkers is not checked here,
-    such as ``plans``, which :func:`as_plans` checks. ``*args`` and ``**kwargs`` are not checked.
+    NumPy scalars are converted to Python numbers. Annotations are evaluated at the first call, so an argument whose
+    type is imported only for type checkers is not checked here. For example, :func:`as_plans` checks ``plans``
+    instead. ``*args`` and ``**kwargs`` are not checked.
     """
 
     def read_hints() -> dict[str, Any]:  # skip the return type, which may come from a package that is not installed
@@ -82,7 +82,7 @@ def typed(function: Function) -> Function:
 
 
 def typed_fields(kind: Class) -> Class:
-    """Decorate a dataclass to check fields against their annotations, as :func:`typed` does, on construction."""
+    """Decorate a dataclass to check fields against their annotations on construction, as :func:`typed` does."""
     init = _checked(kind.__init__, lambda: get_type_hints(kind, include_extras=True))  # type: ignore[misc]
     kind.__init__ = init  # type: ignore[misc]
     return kind
@@ -108,8 +108,9 @@ def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
 
 
 def check_value(argument: str, value: Any, hint: Any) -> Any:
-    """Return ``value`` (NumPy scalars as Python numbers) if it matches a type hint; otherwise raise an
-    :class:`ArgumentError`. Paths that begin with "~/" are expanded, also in lists.
+    """Return ``value`` if it matches a type hint; otherwise raise an :class:`ArgumentError`.
+
+    NumPy scalars are converted to Python numbers. "~/" is expanded in a path, and in each path of a list.
     """
     if not checker(hint)(value):
         choices = [
@@ -168,7 +169,9 @@ def _words(hint: Any) -> str:
         return " or ".join(map(repr, parts))
     if words := _WORDS.get(hint) or _WORDS.get(kind):
         return words
-    if kind in (None, Annotated):
+    if kind is Annotated:
+        return _words(parts[0])
+    if kind is None:
         return f"a {hint.__name__}" if isinstance(hint, type) else str(hint)
     items = [re.sub("^an? ", "", _words(part)) for part in parts if part is not ...]
     return f"{kind.__name__}[{', '.join(items)}]"
@@ -219,7 +222,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def differences(was: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """Return the keys whose values differ in two nested mappings, with both values if short: "steps (40, now 30)"."""
+    """Return the keys whose values differ in two nested mappings, with short values, such as "steps (40, now 30)"."""
     names = []
     for key in sorted({**was, **now}):
         before, after = was.get(key), now.get(key)
@@ -238,7 +241,7 @@ _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlist, _SHORT.maxtu
 
 
 def shown(value: object) -> str:
-    """Return a short ``repr`` of a value for an error message; huge integers and deep nesting do not raise errors."""
+    """Return a short ``repr`` of any value for an error message, without errors for huge integers or deep nesting."""
     try:
         return _SHORT.repr(value)
     except (ValueError, RecursionError):  # Python refuses to print integers of more than 4,300 digits

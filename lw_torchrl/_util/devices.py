@@ -1,4 +1,4 @@
-"""Device helpers: device names, tensor checks without synchronization, seeding, and policies run in blocks of rows."""
+"""Device helpers: parse device names, check tensors without synchronization, set seeds, and run policies in blocks."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -12,14 +12,14 @@ from torch import Tensor
 from torch._C._functorch import is_batchedtensor, is_functorch_wrapped_tensor
 from torch._subclasses.fake_tensor import FakeTensor
 
-from lw_torchrl._util.checks import shown, unknown_name
+from lw_torchrl._util.checks import shown
 
 _ASSERTING = {"cuda"}  # devices on which torch._assert_async checks without synchronization
 
 
 def plain(*tensors: Tensor) -> bool:
-    """Return whether the tensors hold actual values: False while compiling or exporting, or in a ``torch.func``
-    transform."""
+    """Return whether the tensors hold values that Python can read. They do not during compilation or export, or inside
+    a ``torch.func`` transform."""
     if torch.compiler.is_compiling():
         return False
     for tensor in tensors:  # noqa: SIM110 - called at every step, and a generator takes twice as long
@@ -74,37 +74,23 @@ def check_finite(argument: str, tensor: Tensor) -> None:
         check_values(lambda values: values.isfinite().all(), tensor, problem)
 
 
-_NAMES = ("cpu", "cuda", "cuda:0", "mps", "auto")
 CPU = torch.device("cpu")
-BLOCK = 64  # number of rows that a network processes at once
-_ALIGNED = 16  # bytes, at a multiple of which each tensor of a buffer begins
+BLOCK = 64  # number of rows in each forward pass of a policy
+_ALIGNED = 16  # each tensor in a transfer buffer begins at a multiple of this number of bytes
 
 
 def check_device(argument: str, value: Any) -> torch.device:
     """Return a device with an explicit index. ``value`` is a :class:`torch.device`, a PyTorch device name such as
     "cuda" or "cuda:0", or "auto" for this machine's accelerator (the CPU if there is none). Raise a
-    :class:`ValueError` for an unknown or unavailable device, and a :class:`TypeError` for any other type."""
-    if not isinstance(value, (str, torch.device)):
-        raise TypeError(f"{argument} must be a device or a device name, got {shown(value)}")
-    accelerator = torch.accelerator.current_accelerator(check_available=True)
-    available = ["cpu"]
-    if accelerator is not None:
-        kind = accelerator.type
-        available += [kind, *(f"{kind}:{number}" for number in range(torch.accelerator.device_count()))]
-    if value == "auto":
-        value = available[1] if len(available) > 1 else "cpu"
+    :class:`ValueError` for an unknown or unavailable device."""
     try:
-        device = torch.device(value)
-    except RuntimeError:
-        raise unknown_name(argument, value, _NAMES) from None
-    if device.type == "cpu":
-        return CPU
-    if str(device) not in available:
-        known = ", ".join(map(repr, [*available, "auto"]))
-        absent = f"this machine, or this build of PyTorch, has no {device.type.upper()}"
-        reason = "" if device.type in available else f": {absent}"
-        raise ValueError(f"{argument} must be one of {known} here, got {str(device)!r}{reason}")
-    return torch.empty(0, device=device).device
+        accelerator = torch.accelerator.current_accelerator(check_available=True)
+        device = (accelerator or CPU) if value == "auto" else torch.device(value)
+        return CPU if device.type == "cpu" else torch.empty(0, device=device).device
+    except (RuntimeError, AssertionError, TypeError) as error:  # PyTorch raises several types, with long messages
+        reason = str(error).partition("\n")[0]
+        message = f"{argument} must be 'cpu', 'auto' or a device of this machine, got {shown(value)} ({reason})"
+        raise ValueError(message) from error
 
 
 def device_of(module: Any) -> torch.device:
@@ -126,7 +112,7 @@ def place(module: Any, device: str | torch.device | None) -> torch.device:
 
 
 def copied_at_once(tensordict: TensorDictBase, device: torch.device) -> TensorDict:
-    """Copy the tensors of a flat tensordict from the CPU to a device without waiting: one copy, from pinned memory."""
+    """Copy the tensors of a flat tensordict from the CPU to a device in one asynchronous transfer."""
     arrays = {key: value.numpy() for key, value in tensordict.items()}
     ends = list(accumulate(-(-array.nbytes // _ALIGNED) * _ALIGNED for array in arrays.values()))
     buffer = torch.empty(ends[-1], dtype=torch.uint8, pin_memory=device.type == "cuda")

@@ -33,7 +33,7 @@ _SHIPPED = Path(__file__).parents[1] / "training" / "data"
 
 def shipped_policy(name: AnyPath) -> Path | None:
     """Return the path of a shipped policy, such as "few-shot-mt50". Return None if no shipped policy has this name, or
-    if a user's file has the same name."""
+    if a file with this name exists in the current folder."""
     path = _SHIPPED / f"{name}.safetensors"
     return path if Path(name).name == str(name) and not Path(name).exists() and path.is_file() else None
 
@@ -52,8 +52,8 @@ def expanded(path: AnyPath) -> Path:
 
 
 def companion(path: Path, ending: str, *, stem: str | None = None, hidden: bool = False) -> Path:
-    """Return the path of a file next to ``path``, with the same name or ``stem`` and an ending; a name that would be
-    too long for a file system is replaced by a hash."""
+    """Return the path in the folder of ``path`` whose name is ``stem`` (by default the name of ``path``) plus
+    ``ending``. If that is too long for a file system, a hash replaces the stem."""
     name, dot = path.name if stem is None else stem, "." * hidden
     if len(os.fsencode(dot + name + ending)) > _LONGEST:
         name = sha256(os.fsencode(name)).hexdigest()[:32]
@@ -65,8 +65,8 @@ def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename the file to ``path`` when the block ends without an error.
 
     If the process is killed, ``path`` is either the complete old file or the complete new file. With ``sync``, which
-    takes about 10 ms, the same is true if the machine crashes. The file keeps the old file's mode. A link is kept, and
-    the file that it points to is replaced. A device or FIFO, such as /dev/stdout, is written to.
+    takes about 10 ms, the same is true if the machine crashes. The new file has the old file's mode. If ``path`` is a
+    symbolic link, its target is replaced. If it is a device or FIFO, such as /dev/stdout, the content is written to it.
     """
     target = expanded(path)
     if _is_stream(target):
@@ -82,7 +82,7 @@ def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
 
 
 def _opened(stream: Path) -> IO[bytes]:
-    """Open a device or FIFO to write to it; raise :class:`OSError` if nobody reads the FIFO within a second."""
+    """Open a device or FIFO for writing; raise :class:`OSError` if no reader opens the FIFO within a second."""
     end = time.monotonic() + PATIENCE
     while True:
         try:
@@ -112,8 +112,8 @@ def _is_stream(target: Path) -> bool:
 
 @contextmanager
 def replacing_folder(path: AnyPath) -> Iterator[Path]:
-    """Yield a temporary folder, and rename the folder to ``path``, which must not exist or be empty, when the block
-    ends."""
+    """Yield a temporary folder, and rename it to ``path`` when the block ends. ``path`` must be new or an empty
+    folder."""
     with _staged(expanded(path).absolute()) as temporary:
         temporary.mkdir()
         yield temporary
@@ -125,7 +125,7 @@ def replacing_folder(path: AnyPath) -> Iterator[Path]:
 def _staged(target: Path, sync: bool = True) -> Iterator[Path]:
     """Yield a path with the target's name in a private temporary folder, and rename it to ``target`` at the end."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    if sync:  # without sync, there may be many small files, which would make listing the folder slow
+    if sync:  # callers use sync=False to write many small files, and listing their folder each time would be slow
         _remove_abandoned(target)
     folder = companion(target, f".{secrets.token_hex(8)}.tmp", hidden=True)
     folder.mkdir(mode=0o700)
@@ -133,7 +133,7 @@ def _staged(target: Path, sync: bool = True) -> Iterator[Path]:
         yield (temporary := folder / target.name)
         with suppress(FileNotFoundError):
             old = target.stat()
-            with suppress(OSError):  # only root may give files away
+            with suppress(OSError):  # only root may change the owner of a file
                 os.chown(temporary, old.st_uid, old.st_gid)
             temporary.chmod(stat.S_IMODE(old.st_mode))
         os.replace(temporary, target)
@@ -174,7 +174,7 @@ def locked(
     wait: bool = False,
     error: type[ValueError] = ValueError,
 ) -> Iterator[None]:
-    """Lock a file or folder against other threads and processes until the block ends.
+    """Hold the lock of a file or folder until the block ends, so that no other thread or process writes to it.
 
     The lock is released if the process is killed. If another ``who`` (such as "process") holds the lock for more than a
     second, raise ``error`` with a message that names ``argument``; with ``wait``, wait until the lock is released.
@@ -233,8 +233,8 @@ def read_toml(path: Path | Traversable, error: type[ValueError]) -> dict[str, An
 
 
 def read_json(path: AnyPath, what: str) -> dict[str, Any]:
-    """Read a JSON file that holds an object. Raise a :class:`ValueError` that begins with ``what``, such as "root: the
-    metadata", if the file is invalid."""
+    """Read a JSON file that holds an object. Raise a :class:`ValueError` whose message begins with ``what``, such
+    as "root: the metadata", if the file is invalid."""
     try:
         return parse_json(expanded(path).read_bytes())
     except ValueError as error:
@@ -252,7 +252,7 @@ def parse_json(content: bytes) -> dict[str, Any]:
         raise ValueError(f"the JSON must be an object, got {type(value).__name__}")
     brackets = re.sub(rb'"(?:[^"\\]|\\.)*+"|[^][{}"]++', b"", content)
     steps = (1 if bracket in b"[{" else -1 for bracket in brackets)
-    if max(accumulate(steps)) > _DEEPEST:  # such objects can be parsed, but not be written or copied
+    if max(accumulate(steps)) > _DEEPEST:  # Python can parse such objects, but not write or copy them
         raise ValueError("the JSON is nested too deeply")
     return value
 
@@ -271,7 +271,7 @@ def _finite(text: str) -> float:
 
 
 def check_damage(error: Exception) -> None:
-    """Raise ``error`` again if it shows a limit of the system, such as too many open files, and not damage."""
+    """Re-raise ``error`` if its cause is a limit of the system, such as too many open files, not a damaged file."""
     expected = (None, errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EINVAL)
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno not in expected):
         raise error
@@ -279,7 +279,7 @@ def check_damage(error: Exception) -> None:
 
 @contextmanager
 def reading(path: AnyPath, what: str) -> Iterator[None]:
-    """Add the folder's ``path`` and the expected content ``what`` to errors raised in the block."""
+    """Add the folder's path and ``what``, a description of its expected content, to errors raised in the block."""
     try:
         yield
     except FileNotFoundError as error:

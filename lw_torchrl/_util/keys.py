@@ -1,4 +1,4 @@
-"""Helpers for tensordict keys as arguments, and for modules that accept either a tensordict or tensors."""
+"""Helpers for arguments that are tensordict keys, and for modules that accept either a tensordict or tensors."""
 
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -15,7 +15,7 @@ from torch import Tensor
 from lw_torchrl._util.checks import checker, missing_keys
 from lw_torchrl._util.rendering import naming_absent_renderer
 
-with naming_absent_renderer():  # subpackages that use TorchRL import this module first
+with naming_absent_renderer():  # here, because every subpackage that uses TorchRL imports this module first
     import torchrl.envs  # noqa: F401
 
 Keys = Sequence[NestedKey]
@@ -83,7 +83,8 @@ def write(tensordict: TensorDictBase, module: TensorDictModuleBase, values: Sequ
 
 def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Callable[..., Any]:
     """Decorate a module's ``forward`` to accept a tensordict, or (as ``torch.export`` requires) the tensors of
-    ``in_keys`` by position or name. With ``set_skip_existing(True)``, nothing is done if all ``out_keys`` exist."""
+    ``in_keys`` by position or name. Under ``set_skip_existing(True)``, ``forward`` does not run if all ``out_keys``
+    exist."""
 
     @wraps(forward)
     def run(self: TensorDictModuleBase, tensordict: TensorDictBase) -> TensorDictBase:

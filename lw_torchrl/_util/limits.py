@@ -1,4 +1,4 @@
-"""Run programs that read files from others in child processes with limits on memory and time."""
+"""Run programs that read untrusted files in child processes with limits on memory and time."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 _MB = 10**6
-# Each limit is a constant plus a part for the files' size; compressed files are smaller than their content.
+# Each limit is a constant plus a multiple of the files' size. The multiple allows for compressed files.
 _SECONDS, _BYTES_PER_SECOND = 30, _MB
-_PATIENCE = 4  # a busy or waiting process may take longer than its processor time, by this factor
+_PATIENCE = 4  # wall-clock limit divided by the CPU-time limit; a process may have to wait for a busy machine
 _MEMORY, _MEMORY_PER_BYTE = 700 * _MB, 200
 
 
@@ -19,12 +19,15 @@ class LimitError(ValueError):
 
 
 def run_limited(command: Sequence[str | os.PathLike[str]], stored: int) -> subprocess.CompletedProcess[bytes]:
-    """Run a command that reads files of ``stored`` bytes, and return its exit status and output.
+    """Run a command that reads files of ``stored`` bytes; its time and memory limits grow with ``stored``.
 
     Libraries that trust the sizes in a file may allocate gigabytes for a file of a few kilobytes, or never return.
 
+    Returns:
+        The command's exit status and output.
+
     Raises:
-        LimitError: the command took too long, or was killed, for example because it had no more memory.
+        LimitError: the command took too long, or was killed, for example because it ran out of memory.
     """
     seconds, memory = _SECONDS + stored // _BYTES_PER_SECOND, _MEMORY + _MEMORY_PER_BYTE * stored
     environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}
@@ -32,7 +35,7 @@ def run_limited(command: Sequence[str | os.PathLike[str]], stored: int) -> subpr
         command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
         try:
-            with suppress(ImportError, AttributeError, OSError):  # other systems than Linux only have the last limit
+            with suppress(ImportError, AttributeError, OSError):  # outside Linux, only the timeout applies
                 import resource
 
                 resource.prlimit(process.pid, resource.RLIMIT_DATA, (memory, memory))

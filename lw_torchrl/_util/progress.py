@@ -16,7 +16,7 @@ def _duration(seconds: float) -> str:
 
 
 class Progress:
-    """A progress report on stderr; ``initial`` of the ``total`` units are already done."""
+    """A progress report on stderr. ``initial`` is the number of the ``total`` units that are already finished."""
 
     def __init__(self, what: str, total: int, unit: str, *, initial: int = 0, show: bool = True) -> None:
         self.what, self.total, self.unit, self.initial = what, total, unit, initial
@@ -38,7 +38,7 @@ class Progress:
             self._bar.close()
 
     def update(self, units: int = 1) -> None:
-        """Add ``units`` to the number of finished units."""
+        """Add ``units`` to the number of finished units; use a negative number if units must be repeated."""
         self.done += units
         if self._bar is not None:
             self._bar.update(units)
@@ -47,12 +47,6 @@ class Progress:
             if self.done > self.initial:
                 left = f", {_duration(spent / (self.done - self.initial) * (self.total - self.done))} left"
             print(f"{self.what}: {self.done}/{self.total} {self.unit}s{left}{self.notes}", file=sys.stderr, flush=True)
-
-    def set_done(self, units: int) -> None:
-        """Set the number of finished units, which decreases if some units must be repeated."""
-        self.done = units
-        if self._bar is not None:
-            self._bar.n = units
 
     def note(self, **notes: str) -> None:
         """Show notes next to the progress, for example ``loss="0.012"``."""

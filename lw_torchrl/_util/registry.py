@@ -55,7 +55,7 @@ class Registry(UserDict[str, Entry]):
         kind: the word for an entry in error messages, such as "method".
         group: the entry point group, such as "lw_torchrl.methods".
         entries: the shipped entries.
-        check: a function that maps a name and an object to the entry, and raises an error for an invalid object.
+        check: a function ``(name, object) -> entry`` that raises an error for an invalid object.
 
     Raises:
         KeyError: the name is unknown; the message suggests the closest names.

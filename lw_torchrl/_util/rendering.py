@@ -1,4 +1,4 @@
-"""Checks of camera names and image sizes, and an error that names a missing rendering library."""
+"""Check camera names and image sizes, and raise an error that names a missing rendering library."""
 
 import os
 from collections.abc import Iterator, Sequence

@@ -17,7 +17,7 @@ LIBRARIES: tuple[str, ...] = ("lw_torchrl", "numpy", "tensordict", "torch", "tor
 
 
 def episode_hash(purpose: str, task: str | Task, seed: int, episode: int) -> int:
-    """Return a hash in [0, 2**63) of a purpose, task, seed and episode; the hash is the same on every machine."""
+    """Return a hash in [0, 2**63) of a purpose, task, seed and episode, the same on every machine."""
     # For a name such as "desk/push", the suite need not be installed.
     name = task if isinstance(task, str) and "/" in task else get_task(task).name
     text = f"lw_torchrl/{purpose}/{name}/{check_value('seed', seed, int)}/{check_value('episode', episode, Natural)}"

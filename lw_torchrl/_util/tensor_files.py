@@ -83,7 +83,7 @@ class AllocationLimit(TorchDispatchMode):
             numbers = prod(size for size in sizes if isinstance(size, int) and size > 0)
             self.allowed -= 4 * numbers
             if self.allowed < 0:
-                raise ValueError("the description is of larger tensors than the file holds")
+                raise ValueError("the description requires larger tensors than the file holds")
         return func(*args, **kwargs or {})
 
 

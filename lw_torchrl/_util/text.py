@@ -1,21 +1,22 @@
-"""Show text that others wrote, such as plans and answers, on a terminal or in Markdown, without effects of its own."""
+"""Escape untrusted text, such as plans and answers of language models, for a terminal or for Markdown."""
 
 from __future__ import annotations
 
 import re
 from typing import IO, Any
 
-# Characters that control a terminal, or that change the order of other characters, without "\n" and "\t".
+# Characters, except "\n" and "\t", that control a terminal or change the order in which other characters are shown.
 _CONTROL = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb\ud800-\udfff"
     "\U000e0000-\U000e007f]"
 )
-# Characters of links, images, HTML, code, emphasis, tables and mathematics, and the signs of links without brackets.
+# Characters of Markdown's links, images, HTML, code, emphasis, tables and mathematics, and the ":", "." or "@" of
+# addresses that Markdown turns into links, such as https://..., www... or name@host.
 _MARKUP = re.compile(r"[\\`*\[\]<>&|~$#]|(?<=[A-Za-z]):(?=//)|(?<=\b[Ww][Ww][Ww])\.|(?<=\w)@|:(?=\w+@)")
 
 
 def printable(text: str) -> str:
-    r"""Replace control characters, such as a terminal's escape sequences, by Python's notation, such as ``\x1b``.
+    r"""Replace control characters, such as those of terminal escape sequences, with Python escapes, such as ``\x1b``.
 
     Example:
         >>> print(printable("plan\x1b[2J"))
@@ -25,7 +26,7 @@ def printable(text: str) -> str:
 
 
 def markdown(text: object) -> str:
-    r"""Convert a text to one line of Markdown that renders as the same text: no links, images, HTML or emphasis.
+    r"""Convert a text to one line of Markdown that renders as plain text, without links, images, HTML or emphasis.
 
     Example:
         >>> print(markdown("![x](http://a.b/c)"))

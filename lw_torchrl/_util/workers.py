@@ -1,8 +1,8 @@
 """Split episodes over worker processes, because Meta-World's experts and other Python code use one core per process.
 
 The workers are forked from a server process (multiprocessing's "forkserver") that imports the library once and starts
-no threads; a fork of this process would copy locks that other threads hold. Each worker waits in a thread for the end
-of a pipe, so that it ends with this process, however this process ends.
+no threads; a fork of this process would copy locks that other threads hold. A thread in each worker waits until a pipe
+from this process closes, so that the worker exits even if this process is killed.
 """
 
 from __future__ import annotations
@@ -28,9 +28,8 @@ import cloudpickle
 Episodes = Mapping[str, Sequence[int]]  # the indices of each task's episodes
 T = TypeVar("T")
 
-START = 40_000  # time steps that one core simulates while the workers start and compile models
+START = 30_000  # time steps that one core simulates while the workers start and compile models
 _THREADED = 0.64  # measured time of this process with several simulation threads, relative to one thread
-_LARGEST = 64  # episodes per part: enough for networks, which run on blocks of 64 rows, and little lost by Ctrl-C
 _PRELOAD = ["lw_torchrl.evaluation.rollout", "lw_torchrl.data.collect", "metaworld"]
 
 
@@ -40,27 +39,29 @@ def available_cores() -> int:
 
 
 def choose_workers(workers: int | None, time_steps: int) -> int:
-    """Return ``workers``; for None, one per core if that saves time and this process is not a worker itself."""
+    """Return ``workers`` unless it is None. Otherwise return the number of cores if that many workers save time and
+    this process is not a worker itself, else 1."""
     if workers is not None:
         return workers
     cores = available_cores()
-    pays = time_steps * (_THREADED - 1 / cores) >= START  # from 290,000 steps on two cores, from 70,000 on 16
+    pays = time_steps * (_THREADED - 1 / cores) >= START  # from 220,000 steps on two cores, or 55,000 on 16
     return cores if pays and multiprocessing.parent_process() is None else 1
 
 
 def start_early(workers: int | None, time_steps: int) -> None:
-    """Start the server of worker processes, if they will be used, while this process still imports PyTorch."""
+    """Start the server of worker processes, if workers will be used, while this process still imports PyTorch."""
     if choose_workers(workers, time_steps) > 1:
         with _starting():
             forkserver.ensure_running()
 
 
-def split(episodes: Episodes, workers: int) -> list[dict[str, list[int]]]:
-    """Split episodes into parts of equal size, at least one for each worker. A part holds few tasks, because each task
-    takes time to set up.
+def split(episodes: Episodes, workers: int, largest: int) -> list[dict[str, list[int]]]:
+    """Split episodes into parts of equal size: at least one part per worker, and at most ``largest`` episodes per part.
+
+    A part contains few tasks, because each task takes time to set up.
     """
     listed = [(task, episode) for task, numbers in episodes.items() for episode in numbers]
-    number = min(len(listed), workers * -(-len(listed) // (workers * _LARGEST)))
+    number = min(len(listed), workers * -(-len(listed) // (workers * largest)))
     parts: list[dict[str, list[int]]] = [{} for _ in range(number)]
     for place, (task, episode) in enumerate(listed):
         parts[place * number // len(listed)].setdefault(task, []).append(episode)
@@ -74,20 +75,23 @@ def spread(
     *,
     workers: int | None,
     max_steps: int,
+    largest: int,
     alone: bool = False,
 ) -> Generator[T]:
     """Yield the items of ``run(episodes, on_steps)``, computed for parts of the episodes in worker processes.
 
-    Errors of a worker are raised here, with a note that lists the part's episodes; warnings are issued here.
+    An error in a worker is raised in this process, with a note that lists the part's episodes. A warning in a worker is
+    issued in this process.
 
     Args:
-        run: a function that runs episodes and calls ``on_steps`` with the number of new time steps. In workers, a copy
-            runs for each part, and the items are pickled.
+        run: a function that runs episodes and calls ``on_steps`` with the number of new time steps. Workers run a
+            pickled copy for each part, and return pickled items.
         episodes: the indices of each task's episodes.
-        workers: number of processes, 1 for this process only. None for one per core, or for this process only if the
-            startup would take longer than it saves, or ``run`` cannot be pickled.
+        workers: number of processes; 1 runs everything in this process. None means one per core, or this process only
+            if starting workers would not save time or ``run`` cannot be pickled.
         max_steps: maximum number of time steps of an episode.
-        alone: whether ``workers=None`` means this process only.
+        largest: maximum number of episodes in a part. The items of a part arrive together, when it is done.
+        alone: if true, ``workers=None`` means this process only.
 
     Raises:
         ValueError: ``run`` cannot be pickled.
@@ -95,7 +99,7 @@ def spread(
     """
     time_steps = sum(map(len, episodes.values())) * max_steps
     number = 1 if alone and workers is None else choose_workers(workers, time_steps)
-    parts, pickled = split(episodes, number), b""
+    parts, pickled = split(episodes, number, largest), b""
     if min(number, len(parts)) > 1:
         try:
             pickled = cloudpickle.dumps(run)
@@ -114,7 +118,7 @@ def _in_workers(pickled: bytes, parts: list[Any], workers: int, on_steps: Callab
     try:
         with _starting():
             running: dict[Future[Any], Any] = {pool.submit(_work, part): part for part in parts}
-            pool.submit(int)  # the executor notices the death of a process that it started before the last submission
+            pool.submit(int)  # the executor watches only the processes that it started before the latest submission
         while running:
             done = wait(running, timeout=0.2, return_when=FIRST_COMPLETED).done
             while steps.poll():
@@ -133,7 +137,7 @@ def _in_workers(pickled: bytes, parts: list[Any], workers: int, on_steps: Callab
 
 @contextmanager
 def _starting() -> Iterator[None]:
-    """Keep the processes that are started from importing the user's script and from reacting to Ctrl-C."""
+    """Prevent processes that are started in the block from importing the user's script and from reacting to Ctrl-C."""
     forkserver.set_forkserver_preload(_PRELOAD)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")

@@ -58,7 +58,7 @@ class Collect:
         policy: Any = self.policy
         behaviour = self.behaviour
         options.start_workers(policy, self.device, self.workers, len(tasks) * self.episodes)
-        # Imported here, because these take seconds, in which the workers start.
+        # Import these slow modules only here, while the worker processes start.
         from lw_torchrl._util.devices import place
         from lw_torchrl.data.collection_policy import BEHAVIOURS
 
@@ -88,7 +88,7 @@ def _show_dataset(output: Output, dataset: Demonstrations) -> Output:
 
 @dataclass(kw_only=True)
 class Show:
-    """Summarize datasets: collection policy, success rate, return. Several datasets are also summarized together.
+    """Summarize datasets: collection policy, success rate, return. Print a joint summary of several datasets, too.
 
     Example: lw-torchrl data show demos/mt10 demos/noisy --check
     """
@@ -200,7 +200,7 @@ class Export:
     to: str  # target format: lerobot (version 3) or minari
     out: Path  # output folder, new or empty
     plans: Annotated[tuple[str, ...], options.OPTIONAL] = ()
-    """plans whose conditions are stored with each row (default: the suite's plans)"""
+    """store with each row which conditions of these plans hold (default: the suite's plans)"""
     suite: options.SuiteName = None
     json: options.Json = False
 
@@ -218,7 +218,7 @@ class Export:
 class Import:
     """Convert another library's dataset to this library's format, and print which columns the source lacks.
 
-    The dataset must hold tasks of an installed suite.
+    The tasks of the dataset must belong to an installed suite.
 
     Example: lw-torchrl data import lerobot/mt10 --out demos/mt10
     """
@@ -228,7 +228,7 @@ class Import:
     format: Maybe[str] = None  # format of the source (default: detected from the files)
     task: Maybe[str] = None  # task of all episodes, if the source does not name one
     task_map: Annotated[Maybe[Path], arg(metavar="FILE")] = None
-    """JSON object: the task for each of the source's task names or numbers, such as {"0": "push"}"""
+    """JSON file that maps the source's task names or numbers to tasks, such as {"0": "push"}"""
     suite: options.SuiteName = None
     behaviour: str = "imported"  # label of the episodes
     episodes: Maybe[Count] = None  # import only the first N episodes of each task
@@ -240,7 +240,7 @@ class Import:
         from lw_torchrl.data.exchange import MissingDataWarning
 
         if self.task is not None and self.task_map is not None:
-            raise ValueError("--task and --task-map exclude each other; use --task-map for several tasks")
+            raise ValueError("--task cannot be combined with --task-map; use only --task-map for several tasks")
         task = self.task if self.task_map is None else read_json(self.task_map, "--task-map:")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -257,10 +257,10 @@ class Import:
 
 @dataclass(kw_only=True)
 class Info:
-    """Describe a policy (its model card), a dataset (as `data show` does) or a recording (its episodes).
+    """Print a policy's model card, the summary of a dataset, or the episodes of a recording.
 
-    Without a path, describe this installation for a bug report: versions, cores, GPU, extras, cache folders, and what
-    makes the library slow on this machine.
+    Without a path, describe this installation for a bug report: versions, cores, GPU, extras, cache folders, and
+    reasons why the library is slow on this machine.
 
     Example: lw-torchrl info few-shot-mt50
     """

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import lw_torchrl as lw
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Flag, Maybe
-from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.tasks import MT10
 
 RECORDED = ("drawer-open", "window-open")
@@ -49,7 +46,7 @@ class Demo:
     """
 
     out: Maybe[Path] = None  # output folder (default: runs/demo, or runs/demo-quick with --quick)
-    quick: Flag = False  # two tasks and little training, in under a minute (the success rate is not meaningful)
+    quick: Flag = False  # train briefly on two tasks, in under a minute (the success rate is not meaningful)
 
     def run(self) -> None:
         options.use_one_thread()
@@ -105,24 +102,9 @@ def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
         result.save(results, checkpoint=out / "checkpoint.safetensors", plans=plans.fingerprint)
     lw.evaluation.plot_success(result, out / "success.png", title="Plan-conditioned behavioral cloning")
     print("4/4  recording a rollout")
-    episodes = run_recorded(actor, config.tasks, **noise)
-    chosen = [episode for episode in episodes if episode.task in RECORDED] or episodes[:1]
-    write_recording(out / "rollout.rrd", chosen, plans, seed=config.evaluation_seed, policy="demo")
+    episodes = run_recorded(actor, RECORDED, **noise)
+    write_recording(out / "rollout.rrd", episodes, plans, seed=config.evaluation_seed, policy="demo")
     print(f"\n{result.table()}\n")
-    print("sequence of highest-weighted skills up to the first success (time steps of each):")
-    for episode in episodes:
-        skills = _active_skills(episode, plans[episode.task])
-        shown = skills if len(skills) <= 8 else [*skills[:4], f"... {len(skills) - 7} changes ...", *skills[-3:]]
-        print(f"  {episode.task}: " + " > ".join(shown))
-    print(f"\nresults   {results}\nfigure    {out / 'success.png'}\npolicy    {out / 'checkpoint.safetensors'}")
+    print(f"results   {results}\nfigure    {out / 'success.png'}\npolicy    {out / 'checkpoint.safetensors'}")
     print(f"recording lw-torchrl view {out / 'rollout.rrd'}")
     return result
-
-
-def _active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[str]:
-    """Return the sequence of highest-weighted skills up to the first success, with the number of time steps of each."""
-    end = episode.first_success
-    largest = episode.steps.get("skill_weights")[:end].argmax(-1).tolist()
-    holds = episode.steps.get("qaf")[:end].any(-1).tolist()
-    names = [plan.steps[i].skill if any_ else "no condition holds" for i, any_ in zip(largest, holds, strict=True)]
-    return [f"{name} ({len(list(group))})" for name, group in groupby(names)]

@@ -15,7 +15,9 @@ from lw_torchrl._util.checks import Count, Natural, Positive, Scale, counted
 from lw_torchrl._util.files import locked, write_json
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Flag, Maybe, Output
+from lw_torchrl.language.nearest import nearest_skill
 from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.skills import ScriptedSkill, load_skills, skills_for
 from lw_torchrl.language.tasks import Task
 
 _PLANS = f"plans that replace the policy's plans: {options.PLANS}"
@@ -29,7 +31,9 @@ class Rollout:
 
     plans: Annotated[options.PlanSources, options.OPTIONAL, arg(help=_PLANS)] = ()
     suite: options.SuiteName = None
-    speed: Maybe[Positive] = None  # scale factor on metres per step, for another robot (default: full speed stays full)
+    speed: Maybe[Positive] = None
+    """with --suite, speed of the new robot's hand as a multiple of the training robot's (default: if the policy
+    requests full speed, the new robot moves at its own full speed)"""
     skill_file: options.SkillFile = None
     task_file: options.TaskFile = None
     text_encoder: options.Encoder = None
@@ -38,7 +42,7 @@ class Rollout:
     noise: Scale = 0.1  # standard deviation of the noise on the executed action
     max_steps: Maybe[Count] = None  # maximum time steps per episode (default: the suite's limit, 500 in Meta-World)
     stop_at_success: Flag = False  # end episodes at the first success; the success rate stays the same
-    attribute: Flag = False  # measure and re-run failed episodes to find their cause
+    attribute: Flag = False  # find out why episodes failed by re-running them with parts of the policy replaced
     reference: Annotated[tuple[str, ...], options.OPTIONAL, arg(metavar="SOURCES", help=_REFERENCE)] = ()
     device: options.Device = "cpu"
 
@@ -58,7 +62,7 @@ class Rollout:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The keyword arguments shared by all library functions that run episodes."""
+        """Keyword arguments for any library function that runs episodes."""
         arguments = {"seed": self.seed, "noise_scale": self.noise, "suite": self.chosen_suite, "device": self.device}
         return arguments | ({} if self.max_steps is None else {"max_steps": self.max_steps})
 
@@ -91,7 +95,7 @@ class Rollout:
             policy = lw.load_actor(name, text_encoder=options.read_encoder(self.text_encoder))
             if suite is not None and lw.modules.layout_of(policy) != suite.layout:  # a policy for another robot
                 if (plans := plans or suite.plans) is None:
-                    raise ValueError(f"suite {suite.name!r} has no plans; pass some with --plans")
+                    raise ValueError(f"suite {suite.name!r} has no plans; pass plans with --plans")
                 plans = canonical_like(plans, lw.modules.plans_of(policy))
                 policy, plans = TransferredActor(policy, plans, speed=self.speed), None
         if plans is not None:
@@ -111,12 +115,31 @@ class Rollout:
         if name == "expert":
             return suite_expert(suite, tasks), plans
         if plans is None:
-            raise ValueError(f"suite {suite.name!r} has no plans for policy {name!r}; pass some with --plans")
+            raise ValueError(f"suite {suite.name!r} has no plans for policy {name!r}; pass plans with --plans")
         skills = options.read_skills(self.skill_file, self.known) if self.skill_file else suite.skills
+        _check_scripted(plans, skills or load_skills(), self.plans)
         if name == "scripted":
             return lw.ScriptedSkillActor(plans, skills=skills), plans
         behaviour = behaviour_of(name, tasks, suite=suite)
         return SegmentActor(behaviour, plans, self.seed, self.max_steps or suite.max_steps, skills=skills), plans
+
+
+def _check_scripted(plans: Plans, skills: Mapping[str, ScriptedSkill], sources: tuple[str, ...]) -> None:
+    """Raise a ValueError that names the steps of a plan that have no scripted skill, each with the task's nearest."""
+    for task, plan in plans.items():
+        own = skills_for(plan.definition, skills)
+        faults = [
+            f"step {number} {step.skill!r} (nearest: {nearest_skill(step.skill, plan.definition, own)[0].text!r})"
+            for number, step in enumerate(plan.steps, 1)
+            if step.skill not in skills
+        ]
+        if faults:
+            name = task.replace("/", "__")
+            paths = [Path(source, part) for source in reversed(sources) for part in (f"{name}.plan", "")]
+            files = sorted((path for path in paths if path.is_file()), key=lambda path: path.stem != name)
+            file = files[0] if files else task
+            remedy = f"use the texts of scripted skills: `lw-torchrl plan read {file} --scripted --out my-scripts`"
+            raise ValueError(f"{file}: no scripted skill for {', '.join(faults)}; {remedy}")
 
 
 @dataclass(kw_only=True)
@@ -144,7 +167,7 @@ class Evaluate:
         rollout = self.rollout
         tasks, suite = rollout.choose(self.tasks), rollout.chosen_suite
         options.start_workers(self.policy, rollout.device, self.workers, len(tasks) * self.episodes)
-        # Imported here, because these take seconds, in which the workers start.
+        # Import these slow modules only here, while the worker processes start.
         from lw_torchrl.data.collection_policy import BEHAVIOURS
         from lw_torchrl.training.checkpoint import demonstrated_tasks
 
@@ -201,8 +224,6 @@ class Evaluate:
         page: dict[str, Any] = {"seed": rollout.seed, "policy": options.policy_name(self.policy)}
         failures = {(failure.task, failure.episode): failure for failure in result.failures or ()}
         with new_recording(out / "rollout.rrd") as logger:
-            if failures:
-                logger.show_causes(result)
             for task, number in recorded:
                 run: dict[str, Any] = {"episodes": [number], "evaluator": evaluator, **rollout.arguments}
                 (episode,) = run_recorded(policy, task, **run)
@@ -224,7 +245,9 @@ def episodes_to_record(result: lw.EvaluationResult) -> list[tuple[str, int]]:
 
 
 def _show_plan_use(output: Output, result: lw.EvaluationResult, use: lw.evaluation.PlanUse, plans: Plans) -> None:
-    """Print the result, and how often each plan step was true, was chosen, or was the last step of a failed episode."""
+    """Print the result and, for each plan step, how often its condition held, how often the policy chose the step, and
+    in how many failed episodes the policy got stuck in it.
+    """
     steps = {}
     for task, used in use.tasks().items():
         columns = zip(plans[task].steps, used.true, used.chosen, used.stuck, strict=True)
@@ -237,7 +260,7 @@ def _show_plan_use(output: Output, result: lw.EvaluationResult, use: lw.evaluati
 
 
 def _default_tasks(policy: Any, demonstrated: set[str], suite: lw.suites.Suite | None) -> list[str]:
-    """Return the policy's demonstrated tasks (or all tasks if none is recorded) that a suite can simulate."""
+    """Return the policy's tasks that have demonstrations (all tasks if none has) and that a suite can simulate."""
     from lw_torchrl.suites.suite import known_suite
 
     if (known := lw.modules.tasks_of(policy)) is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,15 +12,19 @@ from tyro.conf import Positional, arg
 import lw_torchrl as lw
 from lw_torchrl._util.checks import Natural, counted, nearest
 from lw_torchrl._util.files import read_text, read_toml
+from lw_torchrl._util.text import printable
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Columns, Maybe, Output, Row
 from lw_torchrl.language.nearest import nearest_skill
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.plan_files import PLAN_LIMIT, check_plan
+from lw_torchrl.language.plan_files import PLAN_LIMIT, check_pairs, check_plan
 from lw_torchrl.language.skills import ScriptedSkill, skills_for
 from lw_torchrl.language.tasks import MT10, Task
 
-_SOURCE = "a .plan file, a folder of .plan files, a .toml file of skills or tasks, or a suite (name or my_module:suite)"
+_SOURCE = (
+    "a file or folder of plans (.plan, pairs in .json, or any text that `plan read` reads), a .toml file of skills or "
+    "tasks, or a suite (name or my_module:suite)"
+)
 
 
 @dataclass(kw_only=True)
@@ -66,7 +70,7 @@ class Tasks:
         output.table("skills", [_skill_row(skill.for_task(task)) for skill in skills], columns)
         marks = {query: "   (extension)" if extension else "" for query, extension in queries.items()}
         lines = [f"  {query}{mark}" for query, mark in marks.items() if " is not " not in query]
-        print("\nqueries (each can be negated, and several can be joined by 'and'):", *lines, sep="\n")
+        print("\nqueries (each can be negated, and several can be joined by 'and' and 'or'):", *lines, sep="\n")
         print("\nextension: not part of the paper's Language-World")
         return output
 
@@ -87,7 +91,7 @@ def _numbers(values: Iterable[float]) -> str:
 
 @dataclass(kw_only=True)
 class Ask:
-    """Check whether a query holds in a state of a task: the state after the scripted expert has taken N time steps.
+    """Check whether a query holds in the state that the scripted expert reaches after --step time steps of a task.
 
     Example: lw-torchrl query pick-place "Is the gripper open and not above the puck?" --step 40
     """
@@ -140,8 +144,8 @@ class Ask:
 class Check:
     """Validate a file of plans, skills or tasks: report every error with the line and the closest allowed text.
 
-    A suite is simulated for a few time steps; the measured axes, units, gripper and object heights are compared with
-    the suite's layout.
+    A suite is simulated for a few time steps to compare the directions of axes, the units, the gripper and the heights
+    of objects with the suite's layout. Notes do not change the exit status.
 
     Example: lw-torchrl check my-plans/push.plan
 
@@ -149,7 +153,7 @@ class Check:
     """
 
     source: Positional[Annotated[str, arg(metavar="FILE", help=_SOURCE)]]
-    task: Maybe[str] = None  # task for which the plans must be written
+    task: Maybe[str] = None  # task that the plans must be for
     skill_file: options.SkillFile = None
     task_file: options.TaskFile = None
     json: options.Json = False
@@ -162,22 +166,43 @@ class Check:
             raise FileNotFoundError(f"no such file, folder or suite: {self.source!r}")
         if file.suffix == ".toml":
             return _check_toml(output, file, options.read_tasks(self.task_file))
-        files = sorted(file.glob("*.plan")) if file.is_dir() else [file]
+        answers = [path for ending in ("py", "md", "txt", "json", "y*ml") for path in file.glob(f"*.{ending}")]
+        files = (sorted(file.glob("*.plan")) or sorted(answers)) if file.is_dir() else [file]
         if not files:
-            raise FileNotFoundError(f"the folder {self.source!r} holds no .plan files")
+            raise FileNotFoundError(f"the folder {self.source!r} holds no plan files")
         known = options.tasks_of_plans(file, self.task, self.task_file)
         skills = options.read_skills(self.skill_file, known)
         rows: list[dict[str, Any]] = []
         for path in files:
-            plan, faults = check_plan(read_text(path, lw.PlanError, limit=PLAN_LIMIT), self.task, path.name, known)
-            steps = 0 if plan is None else len(plan.steps)
-            notes = [] if plan is None else _skill_notes(plan, skills)
+            plans, faults, notes = self._plans(path, known)
+            steps = sum(len(plan.steps) for plan in plans)
+            notes += [note for plan in plans for note in _skill_notes(plan, skills)]
             rows.append({"file": path, "steps": steps, "faults": faults, "notes": notes})
             verdict = counted(len(faults), "fault") if faults else f"{counted(steps, 'step')}, valid"
             print(*faults, *(f"{path.name}: note: {note}" for note in notes), f"{path.name}: {verdict}", sep="\n")
         if number := sum(len(row["faults"]) for row in rows):
             output.fault = f"{counted(number, 'fault')} in {counted(len(files), 'file')}"
         return output.show("files", rows)
+
+    def _plans(
+        self, path: Path, known: Mapping[str, Task]
+    ) -> tuple[Sequence[lw.ConditionalPlan], list[str], list[str]]:
+        """Parse a file in any supported format; return its plans, the errors, and notes on how it was interpreted."""
+        text = read_text(path, lw.PlanError, limit=PLAN_LIMIT)
+        if path.suffix == ".plan":
+            plan, faults = check_plan(text, self.task, path.name, known)
+            return [] if plan is None else [plan], faults, []
+        if not options.is_answer(path):
+            plans, faults = check_pairs(text, path.name, known)
+            if self.task is not None and self.task not in {plan.task for plan in plans}:
+                faults.append(f"{path.name}: no valid plan for {self.task!r}")
+            return plans, faults, []
+        decoded = lw.decode_plan(text, self.task or options.task_of_answer(path, text, known), tasks=known)
+        faults = [f"{path.name}, line {step.line}: {step.dropped}" for step in decoded.steps if step.dropped]
+        if decoded.plan is None and not faults:
+            faults = [f"{path.name}: no plan can be read: {decoded.reason}"]
+        notes = [printable(str(note)) for note in decoded.notes]
+        return [decoded.plan] if decoded.plan else [], faults, notes
 
 
 def _skill_notes(plan: lw.ConditionalPlan, skills: Mapping[str, ScriptedSkill]) -> list[str]:
@@ -195,7 +220,7 @@ def _skill_notes(plan: lw.ConditionalPlan, skills: Mapping[str, ScriptedSkill]) 
 
 
 def _check_toml(output: Output, file: Path, known: Mapping[str, Task]) -> Output:
-    """Validate a .toml file of tasks or skills; the keys show which."""
+    """Validate a .toml file, which holds tasks or skills depending on its keys."""
     notes: list[str] = []
     try:
         rows = read_toml(file, ValueError)
@@ -221,6 +246,9 @@ def _check_toml(output: Output, file: Path, known: Mapping[str, Task]) -> Output
     return output.show("files", [row], "\n".join(lines))
 
 
+_MARKS = {True: "ok", False: "OFF", None: "note"}
+
+
 def _check_suite(output: Output, name: str) -> Output:
     """Measure each task of a suite in simulation and compare the results with the suite's layout."""
     suite = options.read_suite(name)
@@ -228,10 +256,10 @@ def _check_suite(output: Output, name: str) -> Output:
     rows = lw.suites.check_suite(suite)
     width = [max(len(getattr(row, key)) for row in rows) for key in ("task", "what", "measured")]
     lines = [
-        f"{'ok ' if row.right else 'OFF'}  {row.task:{width[0]}}  {row.what:{width[1]}}  {row.measured:{width[2]}}  "
+        f"{_MARKS[row.right]:4} {row.task:{width[0]}}  {row.what:{width[1]}}  {row.measured:{width[2]}}  "
         f"{'' if row.right else f'expected: {row.wanted}'}".rstrip()
         for row in rows
     ]
-    if wrong := sum(not row.right for row in rows):
+    if wrong := sum(row.right is False for row in rows):
         output.fault = f"{counted(wrong, 'measurement')} of suite {suite.name!r} differ from the suite's layout"
     return output.show("suite", [vars(row) for row in rows], "\n".join(lines))

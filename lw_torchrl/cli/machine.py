@@ -26,7 +26,7 @@ _VARIABLES = (
 
 
 def describe_machine(output: Output) -> Output:
-    """Print the versions, cores, extras and cache folders, and what makes the library slow on this machine."""
+    """Print the versions, cores, extras and cache folders, and the causes of slow speed on this machine."""
     slow = find_slow_parts()
     extras = {name: f"missing: {', '.join(of)}" if of else "installed" for name, of in find_extras().items()}
     sections = {

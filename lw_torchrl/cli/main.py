@@ -13,12 +13,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import is_dataclass
 from importlib import import_module
-from typing import Any, get_args, get_type_hints
-
-from beartype.door import is_bearable
+from typing import Any, get_type_hints
 
 from lw_torchrl import __version__
-from lw_torchrl._util.checks import Count, Natural, Positive, Probability, Scale, nearest
+from lw_torchrl._util.checks import check_value, nearest
 from lw_torchrl._util.text import PrintableStream, printable
 
 # Map each command to its group, class and summary. Classes are imported later, so `lw-torchrl --help` loads no torch.
@@ -50,10 +48,6 @@ Exit status: 0: success; 1: a bug, with a traceback; 2: an error that you can fi
 (LW_TORCHRL_TRACEBACK=1 adds the traceback); 130: stopped by Ctrl-C; 141: broken pipe."""
 _HOME = re.compile(r"^(--[\w-]+=)?~(?=/|$)")  # shells do not expand the ~ of --out=~/file
 _USER_ERRORS = (ValueError, OSError, ImportError, RuntimeError)
-_RANGES: tuple[tuple[Any, str], ...] = (
-    (Count, "at least 1"), (Natural, "at least 0"), (Scale, "at least 0"), (Positive, "above 0"),
-    (Probability, "from 0 to 1"),
-)  # fmt: skip
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -92,9 +86,9 @@ def _expand(match: re.Match[str]) -> str:
 
 @contextmanager
 def _messages_to_stderr() -> Iterator[None]:
-    """Send everything that is printed to stderr, even by compiled code and other processes, until the block ends."""
+    """Redirect stdout to stderr until the block ends, also for compiled code and child processes."""
     stdout, kept = sys.stdout, None
-    with suppress(OSError, ValueError):  # a stream in memory has no number
+    with suppress(OSError, ValueError):  # an in-memory stream has no file descriptor
         number = stdout.fileno()
         stdout.flush()
         kept = os.dup(number)
@@ -104,7 +98,7 @@ def _messages_to_stderr() -> Iterator[None]:
             yield
     finally:
         if kept is not None:
-            stdout.flush()  # text that was written to sys.__stdout__
+            stdout.flush()  # print to stderr what was written to sys.__stdout__ in the block
             os.dup2(kept, number)
             os.close(kept)
 
@@ -114,7 +108,7 @@ def _warning_text(message: Warning | str, category: type[Warning], *_: Any, **__
 
 
 def _run(args: list[str]) -> Any:
-    """Run a command, and return its output, which is printed at the end."""
+    """Run a command and return its output, which the caller prints."""
     args = _import_modules(args)
     if args == ["--version"]:
         print(f"lw-torchrl {__version__}")
@@ -136,29 +130,18 @@ def _run(args: list[str]) -> Any:
     kind = getattr(import_module(f"lw_torchrl.cli.{module}"), attribute)
     markers = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
     command = tyro.cli(kind, prog=f"lw-torchrl {name}", args=args[1 + (" " in name) :], config=markers)
-    _check_ranges(command)
+    _check(command)
     return command.run()
 
 
-def _check_ranges(command: Any) -> None:
-    """Raise a :class:`ValueError` that names the first option whose value is outside the range of its annotation."""
+def _check(command: Any) -> None:
+    """Raise a :class:`ValueError` that names the first option whose value does not match its annotation."""
     for name, hint in get_type_hints(type(command), include_extras=True).items():
         value = getattr(command, name)
         if is_dataclass(value):
-            _check_ranges(value)
-        parts = [*_parts(hint)]
-        for allowed, text in _RANGES:
-            if get_args(allowed)[1] in parts:
-                for number in value if isinstance(value, tuple) else [] if value is None else [value]:
-                    if not is_bearable(number, allowed):
-                        raise ValueError(f"--{name.replace('_', '-')} must be {text}, got {number}")
-
-
-def _parts(hint: Any) -> Iterator[Any]:
-    """Yield all types and validators in a type hint, including nested types and validators."""
-    yield hint
-    for part in get_args(hint):
-        yield from _parts(part)
+            _check(value)
+        else:
+            check_value(f"--{name.replace('_', '-')}", value, hint)
 
 
 def _overview(commands: dict[str, tuple[str, str, str]]) -> str:

@@ -20,7 +20,7 @@ from lw_torchrl._util.checks import Count, counted
 from lw_torchrl._util.files import read_text
 from lw_torchrl._util.text import printable
 from lw_torchrl._util.workers import start_early
-from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.plan_files import PLAN_LIMIT, is_pairs, load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
 from lw_torchrl.language.tasks import TASKS, Task, load_tasks, resolve_tasks
@@ -85,7 +85,7 @@ class Output:
             print(f"{counted(times, 'answer')}: {note}")
 
     def finish(self) -> None:
-        """Print the JSON document, if requested, and raise a :class:`ValueError` if it reports an error."""
+        """Print the JSON document if it was requested, then raise a :class:`ValueError` if there is a ``fault``."""
         if self.as_json:
             print(json.dumps(_plain(self._document), indent=2, allow_nan=False))
         if self.fault:
@@ -132,9 +132,9 @@ WHO = (
     "noisy-30 (scripted, but correct only 60 or 30 % of the time), wrong (random skills of the plan), random, a "
     "policy file, a shipped policy (few-shot-mt50), or a Python object my_module:policy"
 )
-_DEVICE = "device of the networks: cpu, cuda, cuda:1, mps, or auto for a GPU if there is one (the simulation uses CPUs)"
+_DEVICE = "device for the networks: cpu, cuda, cuda:1, mps, or auto for a GPU if available (the simulation uses CPUs)"
 _SUITE = "suite of the tasks, for example fetch, or a Python object my_module:suite"
-_WORKERS = "number of processes that share the episodes (default: one per core, or 1 for little work)"
+_WORKERS = "number of processes that share the episodes (default: one per core if that saves time)"
 _ENCODER = "custom text encoder: a Python function my_module:function that maps N texts to an N x D tensor"
 _TASKS = "MT10, MT50, a suite, or names of tasks"
 _EVALUATOR = (
@@ -142,7 +142,7 @@ _EVALUATOR = (
     "of an evaluator class, or a Python object my_module:evaluator"
 )
 
-# These replace tyro's "(default: )", "(default: None)" and "(default: False)".
+# These hints replace "(default: )", "(default: None)" and "(default: False)" in tyro's help.
 OPTIONAL, REQUIRED = arg(help_behavior_hint=""), arg(help_behavior_hint="(required)")
 T = TypeVar("T")
 Maybe = Annotated[T | None, OPTIONAL]
@@ -155,7 +155,8 @@ TaskFile = Annotated[Maybe[Path], arg(metavar="FILE", help="a .toml file of your
 SkillFile = Annotated[Maybe[Path], arg(metavar="FILE", help="a .toml file of your skills, added to the shipped ones")]
 Encoder = Annotated[Maybe[str], arg(metavar="MODULE:FUNCTION", help=_ENCODER)]
 SuiteName = Annotated[Maybe[str], arg(metavar="SUITE", help=_SUITE)]
-PlanSources = Annotated[tuple[str, ...], arg(metavar="SOURCES", help=f"{PLANS}; the last plan for each task is used")]
+_LAST = "if several sources have a plan for a task, the last one is used"
+PlanSources = Annotated[tuple[str, ...], arg(metavar="SOURCES", help=f"{PLANS}; {_LAST}")]
 Evaluator = Annotated[Maybe[str], arg(metavar="FILE", help=_EVALUATOR)]
 Device = Annotated[str, arg(metavar="DEVICE", help=_DEVICE)]
 Workers = Annotated[Maybe[Count], arg(metavar="N", help=_WORKERS)]
@@ -188,7 +189,7 @@ def read_object(name: str) -> Any:
 
 
 def start_workers(policy: str, device: str, workers: int | None, episodes: int) -> None:
-    """Start worker processes early if ``episodes`` of 500 time steps will use them."""
+    """Start the worker processes early if running ``episodes`` episodes of 500 time steps will use any."""
     if not is_object(policy) and device == "cpu":
         start_early(workers, episodes * 500)
 
@@ -219,12 +220,12 @@ def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> 
 
 
 def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite | None:
-    """Load the suite ``name``, or else the suite that ``tasks`` name ("fetch" or "fetch/push"); None for Meta-World."""
+    """Load the suite ``name`` or, if None, the suite of ``tasks`` ("fetch" or "fetch/push"); None means Meta-World."""
     from lw_torchrl.suites.suite import Suite, find_suite, load_suite, suite_name
 
     if name is None:
         return find_suite(tasks) if any("/" in task or suite_name(task) != "metaworld" for task in tasks) else None
-    suite = import_object("--suite", name) if ":" in name else load_suite(name)
+    suite = import_object("the suite", name) if ":" in name else load_suite(name)
     if not isinstance(suite, Suite):
         raise ValueError(f"--suite {name} must be a Suite, got {type(suite).__name__}")
     return suite
@@ -244,6 +245,22 @@ def tasks_of_plans(path: Path, task: str | None, task_file: Path | None) -> Mapp
         if file.suffix == ".plan" and file.is_file() and (match := _PLAN_TASK.search(read_text(file, PlanError))):
             names += [match[1].replace("__", "/", 1).replace("_", "-")] * ("__" in match[1])
     return read_tasks(task_file, names)
+
+
+def is_answer(file: Path) -> bool:
+    """Return whether a file must be decoded, being neither a .plan file nor JSON of (condition, skill) pairs."""
+    return file.suffix not in (".plan", ".json") or (
+        file.suffix == ".json" and not is_pairs(read_text(file, PlanError, limit=PLAN_LIMIT))
+    )
+
+
+def task_of_answer(file: Path, text: str, known: Mapping[str, Task]) -> str:
+    """Return the task named in the file's name or, if that names none, in a function or a heading of the text."""
+    names = re.findall(r"^\s*def (\w+)|\btask [\"'`]([\w/-]+)[\"'`]", text, re.MULTILINE)
+    for name in (re.sub(r"-\d+$", "", file.stem), *(name for pair in names for name in pair)):
+        if (task := name.replace("__", "/").replace("_", "-")) in known:
+            return task
+    raise ValueError(f"--task is required, because neither the name of {file.name!r} nor its text names a task")
 
 
 def select_tasks(names: Sequence[str], tasks: Mapping[str, Task], suite: lw.suites.Suite | None = None) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +36,7 @@ Format = Annotated[str, arg(help=f"plan format: {_FORMATS}")]
 
 @dataclass(kw_only=True)
 class Prompt:
-    """Print the prompt that asks a language model for a plan: plans of three other tasks as examples, then the task.
+    """Print the prompt that asks a language model for a plan. Plans for three other tasks serve as examples.
 
     Example: lw-torchrl plan prompt drawer-open --format chain_py
     """
@@ -188,9 +187,9 @@ class Read:
 
     The steps are nested below the conditions that they share. A program may be Python, JSON, YAML or prose.
 
-    A plan that, as written, chooses a correct step in less than three quarters of typical states keeps its motion and
-    objects, but gets standard conditions. A plan without any motion becomes the fallback plan: grasp the first object
-    and move it to the goal.
+    If a plan chooses a correct step in less than three quarters of typical states, its conditions are completed and
+    missing steps are added. A plan without any motion is replaced by the fallback plan: grasp the first object and move
+    it to the goal.
 
     Example: lw-torchrl plan read my-plans/coffee-pull.plan
 
@@ -201,9 +200,9 @@ class Read:
 
     sources: Positional[Annotated[tuple[str, ...], options.REQUIRED, arg(metavar="SOURCES", help=_SOURCES)]]
     task: Maybe[str] = None  # show only the plan for this task (default for an answer: the task in the file name)
-    format: Maybe[str] = None  # plan format of an answer (default: the folder's name, or found by the content)
-    out: Maybe[Path] = None  # folder for the first plan of each task, as a .plan file (not completed)
-    scripted: Flag = False  # read an answer's skills as the nearest scripted skills, which `evaluate scripted` requires
+    format: Maybe[str] = None  # plan format of an answer (default: the folder's name, or detected from the content)
+    out: Maybe[Path] = None  # folder in which to save the first plan of each task, as parsed, in a .plan file
+    scripted: Flag = False  # replace each skill with the nearest scripted skill (`evaluate scripted` requires this)
     task_file: options.TaskFile = None
     json: options.Json = False
 
@@ -231,9 +230,11 @@ class Read:
         return output
 
     def _plans(self, source: str) -> list[tuple[lw.ConditionalPlan, DecodedPlan | None]]:
-        """Return the plans in a source, each with the decoded text of an answer; with --task, only that task's plan."""
+        """Return the plans in a source; with --task, only that task's plan. A plan decoded from a language model's
+        answer comes with the :class:`DecodedPlan`, any other plan with None.
+        """
         file = Path(source)
-        if file.is_file() and file.suffix not in (".plan", ".json"):
+        if file.is_file() and (options.is_answer(file) or (self.scripted and file.suffix == ".plan")):
             return self._decoded(file)
         if file.exists() or source in ("MT10", "MT50"):
             known = options.tasks_of_plans(file, self.task, self.task_file)
@@ -248,25 +249,28 @@ class Read:
         return [(plans[self.task], None)]
 
     def _decoded(self, file: Path) -> list[tuple[lw.ConditionalPlan, DecodedPlan | None]]:
-        """Return a list with the plan in a language model's answer. Without a plan, raise a PlanError if this is the
-        only source, otherwise return an empty list.
+        """Decode a language model's answer and return a list with its plan.
+
+        If the answer has no plan, print the reason and return an empty list, or raise a PlanError if ``file`` is the
+        only source.
         """
         from lw_torchrl.language.plan_decoding import decode_plan
 
-        task, format, folder = self.task or re.sub(r"-\d+$", "", file.stem), self.format, file.absolute().parent.name
-        known = options.read_tasks(self.task_file, (task,) if self.task else ())
-        if task not in known and self.task is None:
-            raise ValueError(f"--task is required, because the file name {file.name!r} does not name a task")
+        format, folder = self.format, file.absolute().parent.name
+        known = options.tasks_of_plans(file, self.task, self.task_file)
         if format is None and folder in PLAN_FORMATS:
             format = folder
-        decoded = decode_plan(read_text(file, ValueError), task, format, tasks=known)
+        text = read_text(file, ValueError)
+        decoded = decode_plan(text, self.task or options.task_of_answer(file, text, known), format, tasks=known)
         if self.scripted and decoded.plan is not None and decoded.scripted is None:
             raise PlanError(f"{file}: --scripted: no step has a scripted skill that is near enough")
         if decoded.plan is not None:
             return [((decoded.scripted if self.scripted else None) or decoded.plan, decoded)]
         if len(self.sources) == 1:
-            raise PlanError(f"{file}: no plan can be read: {decoded.reason}")
+            notes = "".join(f"; {note}" for note in decoded.notes[:10] if note.text != decoded.reason)
+            raise PlanError(f"{file}: no plan can be read: {decoded.reason}{notes}")
         print(f"{file}: no plan can be read: {printable(decoded.reason)}")
+        print(*(f"{printable(str(note))}\n" for note in decoded.notes), sep="", end="")
         return []
 
 
@@ -280,10 +284,11 @@ _COLUMNS: Columns = {
 
 
 def _tree(notes: Sequence[Row], report: CanonicalReport, decoded: DecodedPlan | None) -> list[Row]:
-    """Return the lines of a plan's tree: heads of branches, and steps as in :meth:`CanonicalReport.notes`.
+    """Return the rows of a plan's tree: branch heads, and steps as in :meth:`CanonicalReport.notes`.
 
-    A step also has its ``line`` in the text, the ``path`` of heads above it, and why it was ``dropped``. Steps that are
-    not in the plan follow at the end, and then the steps that replace the plan's own.
+    The row of a step also has the step's ``line`` in the text, the ``path`` of heads above the step, and the reason why
+    the step was ``dropped``, or None. Clauses that did not become steps follow at the end, then the steps that replace
+    the plan's steps.
     """
     from lw_torchrl.language.canonical import SOURCES
 
@@ -291,7 +296,7 @@ def _tree(notes: Sequence[Row], report: CanonicalReport, decoded: DecodedPlan | 
     decoded_steps = () if decoded is None else decoded.steps
     at: list[int | None] = [step.line for step in decoded_steps if not step.dropped] or [None] * count
     own = [
-        {**row, "line": line, "dropped": None if row["skill"] else "no motion of an object is recognised"}
+        {**row, "line": line, "dropped": None if row["skill"] else "no motion of an object is recognized"}
         for row, line in zip(notes[:count], at, strict=True)
     ]
     tree = _branches(own, report.written)

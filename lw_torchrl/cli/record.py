@@ -51,8 +51,6 @@ class Record:
                     rerun: dict[str, Any] = {"actor": policy, "reference": reference, "evaluator": evaluator}
                     attributed = lw.attribute_failures(episodes, plans, **rerun, **arguments)
                     failures = {(failure.task, failure.episode): failure for failure in attributed}
-                    if failures and number == 1:
-                        logger.show_causes(self._result(episodes, attributed))
                 pages.append([])
                 for episode in episodes:
                     failure = failures.get((episode.task, episode.episode))
@@ -65,22 +63,6 @@ class Record:
                 logger.compare(pair, f"{episode.task} · episode {episode.episode} · side by side")
         output = Output(self.json).show("episodes", rows)
         return output.show("recording", out, f"written to {out}\nopen it with: lw-torchrl view {out}")
-
-    def _result(self, episodes: Any, failures: Any) -> lw.EvaluationResult:
-        """Convert the recorded episodes and their failures to an evaluation result."""
-        config = {
-            "tasks": list(dict.fromkeys(episode.task for episode in episodes)),
-            "episodes_per_task": len(self.episodes),
-            "seed": self.rollout.seed,
-            "max_steps": max(len(episode.steps) for episode in episodes),
-        }
-        results = []
-        for episode in episodes:
-            first = episode.first_success
-            results.append(
-                lw.evaluation.EpisodeResult(episode.task, episode.episode, first is not None, first, None, None)
-            )
-        return lw.EvaluationResult(config, tuple(results), failures=tuple(failures))
 
 
 def _report(episode: Any, policy: str, failure: Any) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -68,12 +69,12 @@ class Train:
     json: options.Json = False
 
     def run(self) -> Output:
+        self._check()  # before the imports, which take seconds
         import torch
 
         from lw_torchrl.data.dataset import read_metadata
         from lw_torchrl.training.offline import DISTRIBUTIONS
 
-        self._check()
         options.use_one_thread()
         dataset = read_metadata(self.data).config
         if self.evaluate_every is not None and self.evaluate_seed == dataset.seed:
@@ -105,6 +106,8 @@ class Train:
         return output.show("loss", loss, f"{_trained(steps, loss)}: {self.out}")
 
     def _check(self) -> None:
+        if self.logger in ("wandb", "tensorboard") and find_spec(self.logger) is None:
+            raise ImportError(f"--logger {self.logger} requires the package {self.logger}: pip install {self.logger}")
         if self.begin is not None and self.out.resolve() == self.begin.resolve():
             raise ValueError(f"--out must differ from --begin, got {str(self.out)!r} for both")
         if self.loss != "bc" and (self.evaluator is not None or self.qaf_anchor):
@@ -112,7 +115,7 @@ class Train:
 
     @property
     def _numbers(self) -> dict[str, Any]:
-        """The keyword arguments shared by the configs of all trainers."""
+        """Keyword arguments for the config of any trainer."""
         steps, batch_size = (8000, 500) if self.loss == "bc" else (4000, 250)
         numbers = {"steps": self.steps or steps, "batch_size": self.batch_size or batch_size}
         return {**numbers, "learning_rate": self.learning_rate, "seed": self.seed}
@@ -235,10 +238,7 @@ def make_logger(kind: str, out: Path) -> Any:
         return lw.RerunLogger(out.parent / "logs" / f"{out.stem}.rrd", exp_name=f"{out.parent.name}/{out.stem}")
     from torchrl.record.loggers import get_logger
 
-    try:
-        return get_logger(kind, str(out.parent / "logs"), out.stem)
-    except ImportError as error:
-        raise ImportError(f"--logger {kind} requires the package {kind}: pip install {kind} ({error})") from error
+    return get_logger(kind, str(out.parent / "logs"), out.stem)
 
 
 _CAMERAS = (
@@ -251,7 +251,7 @@ _CAMERAS = (
 class TrainEvaluator:
     """Train a network that replaces the exact condition checker, and report the network's accuracy.
 
-    The training set holds all base queries of the tasks. To resume, run the same command again.
+    The network is trained on all queries that `lw-torchrl tasks TASK` lists. To resume, run the same command again.
 
     Example: lw-torchrl train-evaluator MT10 --out runs/evaluator --held-out-tasks push reach
 
@@ -276,7 +276,7 @@ class TrainEvaluator:
     width: Count = 128  # units of each hidden layer
     depth: Natural = 3  # number of hidden layers
     steps: Maybe[Count] = None  # number of minibatches (default: 6000; 4000 with --cameras)
-    batch_size: Maybe[Count] = None  # state-clause pairs per minibatch (default: 1024), or images (default: 48)
+    batch_size: Maybe[Count] = None  # (state, query) pairs, or images, per minibatch (default: 1024; 48 with --cameras)
     learning_rate: Maybe[Scale] = None  # initial learning rate (default: 0.003; 0.002 with --cameras)
     seed: Natural = 0  # random seed of episodes, held-out choices, initial weights and minibatches
     device: options.Device = "cpu"

@@ -1,4 +1,6 @@
-"""collect_demonstrations: run an expert or another policy, and write the episodes to a dataset; resumable when killed.
+"""collect_demonstrations: run an expert or another policy, and write the episodes to a dataset.
+
+After an interruption, a later call resumes from these files:
 
 root/.partial/begun.json    the config and the package versions
 root/.partial/*.npz         one file per finished episode, so that a killed process loses only the running episodes
@@ -59,7 +61,7 @@ class EpisodeFiles:
         return self.folder / f"{task.replace('/', '+')}.{episode}.npz"
 
     def put(self, task: str, episode: int, steps: TensorDictBase | None) -> None:
-        """Write an episode's rows, or a mark for a failed episode that is redrawn (None)."""
+        """Write the rows of an episode, or, if ``steps`` is None, a mark that the episode failed and is not kept."""
         with replacing(self._path(task, episode), sync=False) as path, path.open("wb") as file:
             if steps is None:
                 file.write(_FAILED)
@@ -156,7 +158,7 @@ def run_missing_episodes(
 
     def run(part: Episodes, on_steps: Callable[[int], object]) -> Iterator[None]:
         """Run episodes and write each to its file."""
-        # Record only the dense reward, because the sparse reward follows from success.
+        # Record only the dense reward, because the sparse reward can be computed from success.
         options: dict[str, Any] = {"suite": suite, "seed": config.seed, "max_steps": config.max_steps}
         options |= {"num_envs": num_rows(part, _ROWS, num_envs), "reward": "dense", "strict": policy is not None}
         env, actor = _env_and_actor(config, policy, LanguageWorldEnv(list(part), **options))
@@ -179,13 +181,14 @@ def run_missing_episodes(
     alone = not isinstance(policy, nn.Module | None) or device_of(policy) != CPU
     with Progress("collecting", total * config.max_steps, "step", initial=before, show=progress) as bar:
         while wanted:
-            how: dict[str, Any] = {"workers": workers, "max_steps": config.max_steps, "alone": alone}
-            with closing(spread(run, wanted, bar.update, **how)) as written:
+            # Small parts: an interrupted collection loses the episodes of unfinished parts.
+            limits: dict[str, Any] = {"workers": workers, "max_steps": config.max_steps, "largest": 64}
+            with closing(spread(run, wanted, bar.update, alone=alone, **limits)) as written:
                 for _ in written:
                     pass
             kept, wanted = _kept_and_missing(config, files)
-            # Move back by the failures that are redrawn.
-            bar.set_done((total - sum(map(len, wanted.values()))) * config.max_steps)
+            # Move the progress back by the failed episodes, which other episodes replace.
+            bar.update((total - sum(map(len, wanted.values()))) * config.max_steps - bar.done)
     return kept
 
 

@@ -197,7 +197,7 @@ def parse_metadata(metadata: Mapping[str, Any], folder: Path) -> Demonstrations:
     if (metadata["format"], metadata["version"]) != (FORMAT, FORMAT_VERSION):
         version = f"{short(metadata['format'])} version {short(metadata['version'])}"
         raise DatasetError(
-            f"root: {str(folder)!r} has the format {version}, but this package reads {FORMAT!r} version "
+            f"root: {str(folder)!r} has format {version}, but this package reads {FORMAT!r} version "
             f"{FORMAT_VERSION}; collect the dataset again"
         )
     config = CollectConfig.from_json(metadata["config"])
@@ -247,7 +247,7 @@ def _path(folder: Path, key: Column) -> Path:
 
 
 def _meta(rows: int, layout: Layout = METAWORLD) -> dict[str, dict[str, Any]]:
-    """Return the content of each folder's meta.json as TensorDict writes it; "" stands for the folder of the rows."""
+    """Return the content that TensorDict writes to the meta.json of each folder; "" is the folder of the rows."""
     folders: dict[str, dict[str, Any]] = {"": {}}
     for (*parents, name), (shape, dtype) in columns_of(layout).items():
         for parent in parents:
@@ -283,7 +283,7 @@ def write_rows(
 
 
 def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) -> EpisodeInfo:
-    """Return the description of an episode with these rows, of which the first is row ``start`` of the dataset."""
+    """Describe an episode with these rows, which begin at row ``start`` of the dataset."""
     checksum = 0
     for key in COLUMNS:
         checksum = crc32(rows.get(key).contiguous().numpy().data, checksum)

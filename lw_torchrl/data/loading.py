@@ -54,7 +54,7 @@ def _read_part(
 
 
 def _choose_keys(rows: TensorDict, keys: Keys) -> TensorDict:
-    """Select columns, after adding the root-level done flags of a rollout (all False), which no file stores."""
+    """Select columns, after adding a rollout's root-level done flags (all False; not stored in files)."""
     for flag in _FLAGS:
         rows.set(flag, torch.zeros(len(rows), 1, dtype=torch.bool))
     known = list(rows.keys(True, True))
@@ -144,13 +144,12 @@ def load_demonstrations(
 
     Args:
         root: the dataset's folder, or a list of folders.
-        episodes: the episodes to load: None for all; N for the first N of each task; or a mapping from each task to
-            load to such a number or a list of episode indices. For a list of folders, a list of such choices.
+        episodes: the episodes to load. None for all; N for the first N of each task; or a mapping from task to N or to
+            a list of episode indices, which loads only these tasks. For a list of folders, a list of such choices.
         keep: a filter on these episodes, for example by success, return or behaviour; see :class:`EpisodeFilter`.
-        label: the content of ``action``. "executed": the executed action, with reward and next; required unless an
-            expert collected the dataset. "expert": the expert's action, in [-1, 1]. "unclipped": the expert's action
-            before clipping, up to 25. "expert" and "unclipped" load neither reward nor next, which belong to the
-            executed action.
+        label: the content of ``action``. "executed" is the executed action, with reward and next; it is required unless
+            an expert collected the dataset. "expert" is the expert's action, in [-1, 1], and "unclipped" the expert's
+            action before clipping, up to 25; both load neither reward nor next, which belong to the executed action.
         reward: the content of ``("next", "reward")`` with label="executed", a name in ``REWARDS``: "sparse" (success as
             0 or 1), "dense" (Meta-World's reward), "cost" or "dense_cost".
         after_success: drop rows more than N time steps after the first success of an episode.
@@ -160,7 +159,7 @@ def load_demonstrations(
         keys: the columns to load; None for all; "rollout" for the columns that :class:`LanguageWorldEnv` rollouts also
             have, so that TorchRL's ``OfflineToOnlineReplayBuffer`` can mix these rows with
             ``rollout.select(*sample.keys(True, True))``.
-        device: the device to copy the rows to: "cuda", "mps" or "auto"; None does not copy the rows.
+        device: the device to copy the rows to, such as "cuda", "mps" or "auto"; None does not copy the rows.
         check: verify the checksums of the episodes, once per process while the files do not change. Verification takes
             one to three seconds per gigabyte.
 

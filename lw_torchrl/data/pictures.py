@@ -27,7 +27,7 @@ from lw_torchrl.data import dataset
 from lw_torchrl.data.dataset import TRAJECTORY, DatasetError, Demonstrations, EpisodeInfo
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.transforms.camera import CameraTransform
+from lw_torchrl.transforms.observations import CameraTransform
 
 _TOGETHER = 8  # number of episodes that are re-run in parallel
 
@@ -85,7 +85,7 @@ def add_pictures(
     """Render pictures of a dataset's rows, as :class:`CameraTransform` would have done during collection.
 
     Each episode is re-run with the stored actions, and the observations must be bit-identical to the stored ones. The
-    pictures are saved as PNGs in the dataset's folder. If a call was interrupted, repeat the call to resume.
+    pictures are saved as PNGs in the dataset's folder. After an interruption, call the function again to resume.
 
     Args:
         root: the dataset's folder, written by :func:`collect_demonstrations`.

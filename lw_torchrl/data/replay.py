@@ -37,13 +37,13 @@ _OVER_TIME = {  # TorchRL's transforms that read several time steps of an episod
 
 
 class DatasetStorage(TensorStorage):
-    """A read-only :class:`torchrl.data.TensorStorage` over the rows of datasets; saved states do not contain the rows.
+    """A read-only :class:`torchrl.data.TensorStorage` over the rows of datasets.
 
     Uniform samplers draw on the CPU, so minibatches are the same on every device.
 
     Args:
         rows: the rows (R,) returned by :func:`load_demonstrations`.
-        fingerprint: a digest that identifies the rows; the only content of ``state_dict``.
+        fingerprint: a digest that identifies the rows; ``state_dict`` contains only this digest, not the rows.
     """
 
     def __init__(self, rows: TensorDict, fingerprint: str) -> None:
@@ -81,7 +81,7 @@ class DatasetStorage(TensorStorage):
 
 
 def _check_transform(transform: Any) -> None:
-    """Raise ValueError for TorchRL transforms that act only when rows are written, and would not change samples."""
+    """Raise ValueError for TorchRL transforms that act only when rows are written, so that samples would not change."""
     if isinstance(transform, Compose):
         for part in transform:
             _check_transform(part)
@@ -93,9 +93,9 @@ def _check_transform(transform: Any) -> None:
 
 
 def _check_time(sampler: Sampler, *transforms: Any) -> None:
-    """Raise ValueError for a transform over time if the rows of a sample do not follow each other in time.
+    """Raise ValueError if a transform reads consecutive time steps, but the rows of a sample are not consecutive.
 
-    A SliceSampler's samples are flat, so that a part before must reshape them, or episodes would be mixed.
+    A SliceSampler returns flat samples, so an earlier transform must reshape them; otherwise episodes would be mixed.
     """
     is_reshaped = False
     for part in (part for transform in transforms if isinstance(transform, Transform) for part in transform.modules()):
@@ -107,7 +107,7 @@ def _check_time(sampler: Sampler, *transforms: Any) -> None:
                 f"BatchSizeTransform(reshape_fn=lambda rows: rows.reshape({shape}))" for shape in ("-1, 16", -1)
             )
             raise ValueError(
-                f"transform: {names.pop()} reads consecutive time steps, but the rows of a sample are of different "
+                f"transform: {names.pop()} reads consecutive time steps, but the rows of a sample come from different "
                 f"episodes; use {working} and transform=Compose({slices}, ..., {rows})"
             )
 
@@ -202,7 +202,8 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         return (rows, info) if return_info else rows
 
     def append_transform(self, transform: Transform, *, invert: bool = False) -> Any:
-        """Append a transform; a :class:`QAFTransform` whose plans have latches adds their column to the rows."""
+        """Append a transform. For a :class:`QAFTransform` whose conditions depend on earlier steps, also add the column
+        ``qaf_latches`` to the rows."""
         _check_time(self.sampler, self.transform, transform)
         self._add_latches(transform)
         return super().append_transform(transform, invert=invert)
@@ -214,7 +215,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         return super().insert_transform(index, transform, invert=invert)
 
     def _add_latches(self, transform: Any) -> None:
-        """Compute the latches of each QAFTransform in all rows, since a sample does not show the earlier steps."""
+        """Compute the latches of each QAFTransform for all rows, because a sample does not contain earlier steps."""
         for part in transform.modules() if isinstance(transform, nn.Module) else ():
             if isinstance(part, QAFTransform) and part.program.num_latches:
                 self._compute_latches(part)
@@ -234,7 +235,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         """Set a sampler, which uses the buffer's generator; in a DataLoader worker, call ``set_rng`` afterwards."""
         _check_time(sampler, getattr(self, "_transform", None))
         before = super().set_sampler(sampler)
-        # The workers of a DataLoader have equal copies of the generator, so that all would draw the same rows.
+        # The workers of a DataLoader have equal copies of the generator, so all workers would draw the same rows.
         if get_worker_info() is None:
             self.set_rng(self._rng)
         return before
@@ -248,21 +249,19 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
                 rows in the same order.
 
         Raises:
-            ValueError: the number of values is wrong, samples already have the name, a value is not finite, or ``of``
-                holds other rows.
+            ValueError: samples already have the name, a value is not finite, or ``of`` holds other rows.
+            RuntimeError: the number of values is not the number of rows.
         """
         written = {key for part in self.transform.modules() for key in getattr(part, "out_keys", None) or ()}
         if name in {*self.storage.get(slice(0, 1)).keys(), *written, "index", "is_target"}:
             raise ValueError(f"name must be new, but samples already have a column {name!r}")
-        if values.dim() == 0 or len(values) != len(self):
-            raise ValueError(f"values must have {len(self)} rows, got a tensor of shape {tuple(values.shape)}")
         if not finite(values):
             raise ValueError(f"values of {name!r} must be finite, got NaN or infinity")
         if of is not None and not torch.equal(*(each.storage[:].get("observation").cpu() for each in (self, of))):
             raise ValueError("of must hold the rows of this buffer in the same order; use the same episodes and keep")
         own = values.detach().clone()
-        self.columns = {**self.columns, name: sha256(own.cpu().contiguous().numpy().tobytes()).hexdigest()}
         self.storage.add_column(name, own.to(self.storage.device))
+        self.columns = {**self.columns, name: sha256(own.cpu().contiguous().numpy().tobytes()).hexdigest()}
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -302,6 +301,6 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         write_tensors(Path(path) / _FILE, {}, {}, self.state_dict())
 
     def loads(self, path: AnyPath) -> None:
-        """Restore the state that :meth:`dumps` saved; raise ValueError if the file is corrupted or fits other rows."""
+        """Restore a state saved by :meth:`dumps`; raise ValueError if the file is corrupted or is for other rows."""
         with reading(path, "buffer's state"):
             self.load_state_dict(pop_state(*read_tensors(Path(path) / _FILE)))

@@ -24,7 +24,7 @@ _MOST = 10.0  # the maximum of Meta-World's dense reward, given at success
 class Reward:
     """A reward computed from a stored reward ("sparse" or "dense") as ``(source + shift) * scale``.
 
-    ``at_success`` is the reward of a successful time step; None applies the formula there, too.
+    ``at_success`` is the reward of a successful time step; if it is None, the formula also applies to such steps.
     """
 
     source: Literal["sparse", "dense"]
@@ -68,8 +68,8 @@ def n_step_returns(rollout: TensorDictBase, n_steps: Count, gamma: Probability) 
     """Compute n-step transitions: replace each row's ``"next"`` with that of the row n - 1 time steps later.
 
     Fewer time steps are used where a trajectory or the rollout ends. Done flags also come from the later row (TorchRL's
-    ``MultiStep`` keeps the flags of the first). ``("next", "reward")`` becomes the discounted sum of rewards, and
-    ``steps_to_next_obs`` (..., T) int64 the number of time steps, which TorchRL's value estimators read.
+    ``MultiStep`` keeps the flags of the first). ``("next", "reward")`` becomes the discounted sum of rewards. The new
+    key ``steps_to_next_obs`` (..., T) int64 is the number of time steps, which TorchRL's value estimators read.
 
     Args:
         rollout: a TensorDict (..., T) with ("next", "reward") and ("next", "done") (..., T, 1). If

@@ -73,7 +73,7 @@ class GroupSampler(Sampler):
     appears or disappears, or if a subclass cannot determine the group of single rows (:meth:`_keys`).
     """
 
-    ran_out = False  # whether the last batch ended an epoch, a pass over the group that takes the most batches
+    ran_out = False  # whether the last batch ended an epoch: a pass over the group whose pass takes the most batches
 
     @typed
     def __init__(self, exact: bool = False) -> None:
@@ -86,7 +86,8 @@ class GroupSampler(Sampler):
         self._length = 0  # number of grouped rows; 0 to group all rows at the next sample
         # The rows of all groups in the order of their passes; the size of each group; the number of rows drawn so far.
         self._order, self._size, self._cursor = none, none, none
-        # The integer weight of each group; the rows that rounding owes each group, in units of 1 / (sum of weights).
+        # The integer weight of each group; the number of rows that each group lacks because earlier shares were
+        # rounded, in units of 1 / (sum of weights).
         self._weight, self._credit = none, none
         self._known: Tensor | None = None  # the key shared by the rows of each group
         self._written: list[Tensor] = []  # indices of rows written since the last batch
@@ -126,7 +127,7 @@ class GroupSampler(Sampler):
         if self._known is None or not self._written:
             return False
         rows, length = torch.cat(self._written).unique(), self._covered(storage)
-        # Group all rows again if rows of the storage changed that were not reported to the sampler.
+        # Group all rows again if the storage changed in rows that it did not report to the sampler.
         if rows[0] < 0 or rows[-1] >= length or int((rows >= self._length).sum()) != length - self._length:
             return False
         keys = self._keys(storage, rows)
@@ -161,7 +162,7 @@ class GroupSampler(Sampler):
         order[:] = order[torch.randperm(len(order), generator=self._rng).numpy()]
 
     def _take(self, order: np.ndarray, cursor: int, count: int) -> tuple[np.ndarray, int]:
-        """Draw ``count`` rows of a group with the rows ``order`` (n,), beginning new passes as needed; also return the
+        """Draw ``count`` rows of a group whose rows are ``order`` (n,), beginning new passes as needed; also return the
         number of rows drawn since the last pass ended.
         """
         parts = []
@@ -220,8 +221,8 @@ class GroupSampler(Sampler):
         worker = get_worker_info()
         if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
             raise RuntimeError(
-                f"each of the DataLoader's {worker.num_workers} workers would draw the same rows: in each, open the "
-                "buffer anew, or replay.set_sampler(...) and replay.set_rng(...); see docs/data.md"
+                f"all {worker.num_workers} workers of the DataLoader would draw the same rows; in each worker, create "
+                "the buffer again, or call replay.set_sampler(...) and replay.set_rng(...) (see docs/data.md)"
             )
         if not len(storage):
             raise ValueError("storage must hold at least one row, but it is empty")
@@ -229,7 +230,7 @@ class GroupSampler(Sampler):
             self._check_restored(storage)
         if (self._written or self._covered(storage) != self._length) and not self._move_written(storage):
             self._group(storage)
-        # NumPy takes a third of PyTorch's time for so few numbers.
+        # For this few numbers, NumPy takes a third of PyTorch's time.
         shares, group, place = (part.numpy() for part in self._layout(batch_size))
         order, size, cursor = self._order.numpy(), self._size.numpy(), self._cursor.numpy()
         starts = size.cumsum() - size
@@ -270,13 +271,8 @@ class GroupSampler(Sampler):
         return dict(zip(_STATE, values, strict=True))
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore a state; raise ValueError if it is invalid, or at the next sample if it was saved for other rows."""
-        if missing := [name for name in _STATE if not isinstance(state_dict.get(name), Tensor)]:
-            raise ValueError(f"state_dict must hold {', '.join(_STATE)}, but {', '.join(missing)} are missing")
+        """Restore a state; the next sample raises ValueError if the state was saved for other rows."""
         order, size, cursor, credit, known, written, length, ran_out = (state_dict[n].cpu().clone() for n in _STATE)
-        fits = len(order) == int(size.sum()) and size.shape == cursor.shape == credit.shape
-        if not fits or bool((cursor >= size).any()):
-            raise ValueError("state_dict: the order, sizes and positions of the passes are inconsistent")
         self._order, self._size, self._cursor, self._credit = order, size, cursor, credit
         self._known, self._written = known if len(known) else None, [written] if len(written) else []
         self._length, self.ran_out = int(length), bool(ran_out)
@@ -304,7 +300,7 @@ class GroupSampler(Sampler):
         write_tensors(Path(path) / _FILE, {}, {}, self.state_dict())
 
     def loads(self, path: AnyPath) -> None:
-        """Restore the state that :meth:`dumps` saved; raise ValueError if the file is corrupted or no sampler state."""
+        """Restore a state saved by :meth:`dumps`; raise ValueError if the file is corrupted or has no sampler state."""
         with reading(path, "sampler's state"):
             self.load_state_dict(pop_state(*read_tensors(Path(path) / _FILE)))
 
@@ -319,9 +315,9 @@ class TaskBalancedSampler(GroupSampler):
     TorchRL does not report ``replay[i] = rows`` to samplers, so use ``extend`` to add rows of other tasks.
 
     Args:
-        task_key: the key of the storage that holds the task: one number per row, of any shape.
-        exact: raise an error if the batch size is not a multiple of the number of tasks. Otherwise the tasks take turns
-            in getting one row more.
+        task_key: the key of the task in the storage, one number per row, of any shape.
+        exact: raise an error if the batch size is not a multiple of the number of tasks. If false, the tasks get the
+            remaining rows in turn.
 
     Raises:
         ValueError: when sampling, if a row has several tasks, or with ``exact``, if the tasks do not divide the batch.
@@ -354,10 +350,10 @@ class TaskBalancedSampler(GroupSampler):
 
 
 class CoLearningSampler(GroupSampler):
-    """A sampler that draws half of every minibatch from a target task, and half in equal parts from the base tasks.
+    """A sampler that draws part of every minibatch from a target task, and the rest in equal parts from the base tasks.
 
     The sampler works in any :class:`torchrl.data.ReplayBuffer`. Each task is drawn without replacement, in its own
-    passes. ``ran_out`` is True at the end of an epoch, the pass that takes the most batches. The sampler draws from the
+    passes. ``ran_out`` is True at the end of an epoch (the pass with the most batches). The sampler draws from the
     replay buffer's generator; a restored state continues with the same batches.
 
     If the rows have a column ``dataset``, which :func:`load_demonstrations` writes for several folders, target rows are
@@ -367,8 +363,8 @@ class CoLearningSampler(GroupSampler):
     Args:
         target: the target task: a name, a :class:`Task` or a task id.
         target_fraction: the target's fraction of a minibatch, between 0 and 1, such as 0.5, 1/3 or Fraction(2, 7).
-        task_key: the key of the storage that holds the task: one number per row, of any shape.
-        exact: raise an error if the batch size cannot be split exactly. Otherwise the shares are rounded, and later
+        task_key: the key of the task in the storage, one number per row, of any shape.
+        exact: raise an error if the batch size cannot be split exactly. If false, the shares are rounded, and later
             batches compensate.
 
     Raises:
@@ -428,7 +424,7 @@ class CoLearningSampler(GroupSampler):
         return label
 
     def row_weights(self, storage: Storage) -> Tensor:
-        """Return the mean fraction of a minibatch that each row makes up, (R,) float32; 0 for rows never drawn."""
+        """Return the expected fraction of a minibatch that each row takes, (R,) float32; 0 for rows never drawn."""
         label = self._label(storage)
         sizes = label[label >= 0].bincount()
         share = torch.tensor(self._weights(len(sizes))[0], dtype=torch.float32)

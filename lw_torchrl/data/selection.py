@@ -44,10 +44,6 @@ class EpisodeFilter:
     behaviours: tuple[str, ...] | None = None
     else_best: Probability | None = None
 
-    def __post_init__(self) -> None:
-        if self.behaviours == ():
-            raise ValueError("behaviours must hold at least one label, got none")
-
     def choose(self, parts: Sequence[Demonstrations], returns: Sequence[Tensor]) -> list[Demonstrations]:
         """Return the parts with only the kept episodes, given the return and length (E, 2) of each part's episodes."""
         labels = {part.config.behaviour for part in parts}
@@ -108,22 +104,17 @@ def choose_episodes(dataset: Demonstrations, choice: EpisodeChoice, argument: st
         if task not in existing:
             raise unknown_name(f"{argument}: task", task, existing)
         of_task, place = existing[task], f"{argument}[{task!r}]"
-        if isinstance(wanted, Sequence):
-            numbers = list(wanted)
-        elif check_value(place, wanted, Count) > len(of_task):
-            raise ValueError(f"{place}: the dataset has only {len(of_task)} episodes of {task!r}, got {wanted}")
-        else:
-            numbers = of_task[:wanted]
-        if missing := sorted(set(numbers) - set(of_task)):
-            raise ValueError(f"{place}: the dataset holds the episodes {shown(of_task)}, got {shown(missing)}")
-        if not numbers or len(set(numbers)) < len(numbers):
-            raise ValueError(f"{place} must list at least one episode and no duplicates, got {shown(numbers)}")
+        numbers = list(wanted) if isinstance(wanted, Sequence) else of_task[: check_value(place, wanted, Count)]
+        is_short = not isinstance(wanted, Sequence) and len(numbers) < wanted
+        if is_short or not numbers or len({*numbers}) < len(numbers) or not {*numbers} <= {*of_task}:
+            allowed = f"a number up to {len(of_task)}, or distinct episodes in {shown(of_task)}"
+            raise ValueError(f"{place} must be {allowed}, got {shown(wanted)}")
         keep |= {(task, number) for number in numbers}
     return replace(dataset, episodes=tuple(e for e in dataset.episodes if (e.task, e.episode) in keep))
 
 
 def kept_rows(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, Tensor]:
-    """Return the indices of the rows up to ``after`` steps after each first success, and their number per episode."""
+    """Return the indices of the rows up to ``after`` steps after each first success, and the number per episode."""
     cuts = [e.length if after is None or e.first_success is None else e.first_success + after for e in episodes]
     starts = torch.tensor([e.start for e in episodes], dtype=torch.int64)
     lengths = torch.tensor([min(e.length, cut) for e, cut in zip(episodes, cuts, strict=True)], dtype=torch.int64)

@@ -1,5 +1,6 @@
-"""run_episodes: run exactly the requested episodes on any number of parallel environments, to collect data or evaluate
-a policy.
+"""run_episodes: run exactly the requested episodes on any number of parallel environments.
+
+Data collection and evaluation use this function.
 """
 
 from collections import deque
@@ -15,7 +16,7 @@ from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
 from lw_torchrl._util.devices import CPU, in_blocks, place
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.envs.seeding import action_noise
+from lw_torchrl.envs.rows import action_noise
 
 
 def first_success(success: Tensor) -> int | None:
@@ -25,7 +26,7 @@ def first_success(success: Tensor) -> int | None:
 
 
 class FinishedEpisode(NamedTuple):
-    """A finished episode: the task's name, the episode's index, and the recorded keys of T time steps, batch (T,)."""
+    """A finished episode: its task's name, its index, and the recorded keys of its T time steps (batch size (T,))."""
 
     task: str
     episode: int
@@ -40,14 +41,15 @@ class FinishedEpisode(NamedTuple):
 
 
 def num_rows(episodes: Mapping[str, Sequence[int]], most: int, num_envs: int | None = None) -> int:
-    """Return the number of environments to step together: ``num_envs``, or equally many for each task and about
-    ``most``, but no more than can be busy."""
+    """Return the number of environments to step together: ``num_envs``, or, if it is None, about ``most``, equally many
+    for each task. The number never exceeds the number of episodes that can run at once."""
     tasks, longest = len(episodes), max(map(len, episodes.values()))
     return min(tasks * longest, tasks * max(1, most // tasks) if num_envs is None else num_envs)
 
 
 def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:
-    """Return the actor on a device; networks run on blocks of a fixed size, so that rows do not affect each other."""
+    """Return an actor as a policy that runs on ``device``. Networks process blocks of a fixed number of rows, so that
+    rows do not affect each other."""
     actor_device = place(actor, device)
     policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
     if actor_device == CPU:
@@ -86,15 +88,18 @@ def run_episodes(
 
     Args:
         env: a LanguageWorldEnv, with or without transforms.
-        policy: a callable on all N rows, with a ``_step`` mask of the active rows.
+        policy: a function of a TensorDict of all N rows, whose ``_step`` mask (N,) bool marks the active rows.
         episodes: a mapping from task name to episode indices; repeated indices are run repeatedly.
-        keys: the keys to record at each time step, such as ``("next", "success")``; ``action`` is the executed action.
-        noise: a function that maps an episode index to A standard deviations of the action's noise; None for no noise.
+        keys: the keys to record at each time step, such as ``("next", "success")``. The recorded ``action`` is the
+            executed action.
+        noise: a function that maps an episode index to the standard deviations (A,) of the noise on the action; None
+            for no noise.
         noise_hold: number of time steps for which each noise value stays the same.
         after_success: end an episode N time steps after its first success; None to never end early.
-        clean_action: key for the action before noise is added.
-        place: key for the position of each row's episode in its task's list, (N,) int64, which the policy reads.
-        on_progress: called after each step with the number of new steps, including those that an early end skips.
+        clean_action: the key to which to write the action before noise is added.
+        place: the key to which to write the position (N,) int64 of each row's episode in its task's list, for the
+            policy.
+        on_progress: called after each step with the number of new steps; the steps that an early end skips also count.
     """
     base = env.base_env if isinstance(env, TransformedEnv) else env
     if not isinstance(base, LanguageWorldEnv):

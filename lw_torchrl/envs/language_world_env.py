@@ -21,10 +21,9 @@ from lw_torchrl._util.checks import Count, Natural, check_value, typed
 from lw_torchrl._util.devices import CPU, check_device, copied_at_once
 from lw_torchrl._util.keys import row_mask
 from lw_torchrl._util.rendering import check_picture
-from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec
-from lw_torchrl.envs.seeding import EpisodeCounter
+from lw_torchrl.envs.rows import EpisodeCounter, RowStates, action_spec, clipped_action, done_spec, observation_spec
 from lw_torchrl.language.tasks import Task, one_layout
-from lw_torchrl.suites.engine import Engine, EngineStep
+from lw_torchrl.suites.engine import Engine
 from lw_torchrl.suites.metaworld import make_engine
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
@@ -47,7 +46,7 @@ class LanguageWorldEnv(EnvBase):
     ``close()`` frees the simulators; the next ``reset()`` makes new simulators and continues with the next episodes.
     ``state_dict`` holds the seed and the episode counters; after loading, reset the environment to continue with the
     next episodes. A TransformedEnv or Collector saves this state only with a
-    :class:`~lw_torchrl.transforms.QAFTransform` or :class:`~lw_torchrl.transforms.EnvState`.
+    :class:`~lw_torchrl.transforms.QAFTransform` or :class:`~lw_torchrl.transforms.CameraTransform`.
 
     Keys (B = (N,)); rows outside a ``_step`` mask do not move, rows outside a ``_reset`` mask are not reset:
         observation: (N, 39) float32, Meta-World's vector: metres, gripper opening in [0, 1], quaternions.
@@ -68,16 +67,17 @@ class LanguageWorldEnv(EnvBase):
         seed: any integer; :meth:`set_seed` restarts at episode 0.
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks, or its name; None for the suite in the tasks'
             names, as in "fetch/push", or Meta-World for names without a suite.
-        engine: None for the suite's engine; for Meta-World, "vectorized" (default), or "metaworld", a slower loop over
-            Meta-World's environments with the same results; another name in
-            :data:`~lw_torchrl.suites.metaworld.ENGINES`; or a callable ``(row_tasks, *, reward, num_threads) ->
-            Engine``. For versions of Meta-World or MuJoCo that the vectorized engine does not reproduce, the default is
-            "metaworld", with a warning.
+        engine: the simulator; None for the suite's default. For Meta-World, "vectorized" (default); "metaworld", a
+            slower loop over Meta-World's own environments with the same results; or another name in
+            :data:`~lw_torchrl.suites.metaworld.ENGINES`. For a custom engine, a callable ``(row_tasks, *, reward,
+            num_threads) -> Engine``. If the vectorized engine does not reproduce the installed version of Meta-World or
+            MuJoCo, None selects "metaworld" and issues a warning.
         num_threads: number of simulation threads, by default the cores available to this process. The number of
             threads never changes a result.
         reward: "sparse", the success as 0 or 1; or "dense", Meta-World's dense reward.
         max_steps: simulation steps until truncation; None for the suite's default (Meta-World: 500).
-        frame_skip: simulation steps for each action; their rewards are added, and any of these steps may succeed.
+        frame_skip: number of simulation steps per action. Their rewards are added, and a time step counts as successful
+            if any of them succeeds.
         terminate_on_success: end an episode at its first success, and set ``terminated``.
         strict: raise an error on a NaN action, instead of truncating the row with a warning.
         worker: (w, W), this environment's index among W environments; None for a single environment.
@@ -88,7 +88,6 @@ class LanguageWorldEnv(EnvBase):
         RuntimeError: a row takes a step after its episode has ended, or a process forked after construction uses the
             environment.
         TypeError: the environment is pickled or copied; pass a function that makes the environment instead.
-        ValueError: the ``step`` of a custom engine does not return an EngineStep.
         ImportError: the rendering library set by MUJOCO_GL is missing, or ``engine="vectorized"`` does not reproduce
             the installed version of Meta-World or MuJoCo.
 
@@ -174,7 +173,7 @@ class LanguageWorldEnv(EnvBase):
 
     @property
     def seed(self) -> int:
-        """The seed, which, with task and episode, determines every reset."""
+        """The seed. Together with the task and the episode, it determines every reset."""
         return self._counter.seed
 
     def get_extra_state(self) -> Tensor:
@@ -187,11 +186,11 @@ class LanguageWorldEnv(EnvBase):
         self._rows.over[:] = True
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Restore seed and episode counters of an environment with the same rows; reset it before the next step."""
+        """Restore the seed and episode counters saved by an environment with the same rows; call ``reset`` next."""
         if strict and not state_dict:
             raise ValueError(
                 "state_dict is empty: a Collector saves the state of an environment only in a TransformedEnv with a "
-                "QAFTransform or EnvState, or in a SerialEnv or ParallelEnv; use strict=False to begin at episode 0"
+                "QAFTransform, or in a SerialEnv or ParallelEnv; use strict=False to begin at episode 0"
             )
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
@@ -247,9 +246,6 @@ class LanguageWorldEnv(EnvBase):
     def _simulate(self, action: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Simulate one time step of the rows in the mask ``rows``; return the reward (N,) float64."""
         result = self._engine.step(action, rows)
-        if not isinstance(result, EngineStep):
-            returned = f"{type(self._engine).__name__}.step returned {type(result).__name__}"
-            raise ValueError(f"engine: {returned}, but must return an EngineStep")
         self._report(result.fault & rows, "its simulation became unstable")
         np.copyto(self._rows.observation, result.observation, casting="same_kind", where=rows[:, None])
         success = result.success & rows
@@ -261,7 +257,7 @@ class LanguageWorldEnv(EnvBase):
         return np.where(rows, result.reward, 0.0)
 
     def _report(self, rows: np.ndarray, problem: str, is_error: bool = False) -> None:
-        """Flag rows as faulty and warn, or raise an error if ``is_error``; do nothing if no row is set."""
+        """Set the ``fault`` flag of the rows in a mask and warn, or raise an error if ``is_error``."""
         if not rows.any():
             return
         row = int(np.flatnonzero(rows)[0])
@@ -290,20 +286,17 @@ class LanguageWorldEnv(EnvBase):
         Raises:
             RuntimeError: a row was not reset, or the process was forked from a process that rendered.
             ImportError: OpenGL is missing; the message names what to install.
-            NotImplementedError: a custom engine has no ``render``.
+            AttributeError: a custom engine has no ``render``.
         """
         self._check_process()
         check_picture(camera, height, width)
         drawn = range(len(self.row_tasks)) if rows is None else [check_value("rows", row, Natural) for row in rows]
-        if drawn and max(drawn) >= len(self.row_tasks):
-            raise ValueError(f"rows must be below {len(self.row_tasks)}, got {max(drawn)}")
         if self.is_closed or (self._rows.episode[list(drawn)] < 0).any():
             raise RuntimeError("there is nothing to render before a reset: call env.reset()")
-        if not hasattr(self._engine, "render"):
-            raise NotImplementedError(f"engine {type(self._engine).__name__} has no method render; see suites.cameras")
         if not drawn:
             return torch.zeros(0, height, width, 3, dtype=torch.uint8, device=self.device)
-        pixels = self._engine.render(drawn, camera=camera, height=height, width=width)
+        engine: Any = self._engine
+        pixels = engine.render(drawn, camera=camera, height=height, width=width)
         pictures = torch.from_numpy(pixels).to(self.device)
         return pictures if self.batch_size else pictures[0]
 

@@ -40,7 +40,7 @@ class PartScore:
         return sum(sum(self.correct[name]) for name in names) / sum(sum(self.total[name]) for name in names)
 
     def balanced_accuracy(self, predicate: str | None = None) -> float:
-        """Return the mean of the accuracies on false and on true clauses, leaving out a truth value without answers."""
+        """Return the mean of the accuracies on false and true clauses; a truth value without answers is left out."""
         names = self.total if predicate is None else [predicate]
         tables = self.correct, self.total
         counts = [[sum(table[name][truth] for name in names) for table in tables] for truth in (0, 1)]

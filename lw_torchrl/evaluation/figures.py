@@ -9,17 +9,12 @@ import numpy as np
 
 from lw_torchrl._util.checks import counted, typed
 from lw_torchrl._util.files import AnyPath, replacing
-from lw_torchrl.evaluation.diagnose.failure import CAUSES
+from lw_torchrl.evaluation.diagnose.failure import CAUSE_COLORS, CAUSES
 from lw_torchrl.evaluation.result import EvaluationResult, wilson_interval
 
 _FORMATS = (".png", ".svg", ".pdf", ".jpg", ".jpeg")
 COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
 _LONG_LABEL = 50  # longest legend label, in characters, that still fits into two columns
-_CAUSE_COLORS: dict[str, str] = {
-    **{"query": "#4c78a8", "plan": "#f58518", "skill": "#54a24b", "out of time": "#b279a2", "undecided": "#bab0ac"},
-    **{"not reproducible": "#d5cec9", "perception": "#72b7b2", "gripper": "#eeca3b", "actuation": "#9d755d"},
-    **{"policy": "#e45756", "environment differs": "#ff9da6", "noise": "#7f7f7f"},
-}
 
 
 def check_image(path: AnyPath | None) -> None:
@@ -112,7 +107,7 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
         if not any(numbers):
             continue
         label = f"{cause}: {meaning} ({sum(numbers)})"
-        bars = axes.barh(tasks, numbers, left=left, color=_CAUSE_COLORS[cause], label=label, height=0.7)
+        bars = axes.barh(tasks, numbers, left=left, color=CAUSE_COLORS[cause], label=label, height=0.7)
         axes.bar_label(bars, [str(n) if n else "" for n in numbers], label_type="center", color="white", fontsize=8)
         left = left + numbers
     axes.set_xlim(0, trials * 1.02)

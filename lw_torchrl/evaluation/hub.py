@@ -43,7 +43,8 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
 
     Args:
         policy: the policy's file, or the name of a shipped policy.
-        result: an evaluation of the policy; None for a shipped policy's stored result (other policies: no rates).
+        result: an evaluation of the policy; None for the stored result of a shipped policy. For any other policy, None
+            gives a card without success rates.
         repo: the Hub repository that the card loads the policy from, such as "me/my-policy"; "" to load from the file.
 
     Returns:
@@ -148,7 +149,7 @@ def _value(value: object) -> str:
 
 
 def _code(text: object) -> str:
-    """Return a Markdown code span, in which nothing is a link."""
+    """Return a Markdown code span, so that addresses in the text do not become links."""
     return f"`{printable(str(text)).replace('`', '')}`"
 
 
@@ -224,7 +225,7 @@ def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encode
     Raises:
         FileNotFoundError: the folder contains no policy, or neither a folder nor a repository of that name exists.
         ImportError: the extra ``[hub]`` is not installed.
-        ValueError: ``source`` is a file; or see :func:`~lw_torchrl.load_actor`.
+        ValueError: ``source`` is a file, or the policy file is invalid (see :func:`~lw_torchrl.load_actor`).
     """
     if Path(source).is_dir():
         return load_actor(Path(source) / POLICY_FILE, text_encoder=text_encoder)

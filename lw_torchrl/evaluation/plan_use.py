@@ -20,7 +20,6 @@ from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.suites.metaworld.experts import ExpertActor
 
 _AFTER = 20  # time steps after the first success that still count, as in training data
-_A_WHILE = 5  # number of states in which a plan step must be active to count as reached
 _LATE = 50  # number of last states of a failed episode, in which the episode makes no progress
 
 
@@ -28,7 +27,7 @@ _LATE = 50  # number of last states of a failed episode, in which the episode ma
 class TaskUse:
     """Statistics of one task's plan over all episodes of the task, each up to 20 time steps after the first success.
 
-    If no skill weights were recorded, ``chosen`` is empty; ``stuck`` and ``furthest`` then count true conditions.
+    If no skill weights were recorded, ``chosen`` is empty; ``stuck`` then counts true conditions.
     """
 
     states: int  # number of states
@@ -38,7 +37,6 @@ class TaskUse:
     gaps: list[tuple[int, int, int]]  # intervals in which no condition held: episode, first and last time step
     num_true: float  # the median number of conditions that held before the first success
     stuck: list[int]  # for each plan step, the number of failed episodes that chose it most in the last 50 states
-    furthest: list[int]  # for each plan step, the number of failed episodes in which it was the last chosen 5 times
     failed: int  # number of failed episodes
 
     def to_json(self) -> dict[str, Any]:
@@ -74,30 +72,18 @@ class PlanUse:
         return {task: _sum(episodes) for task, episodes in sorted(self._episodes.items())}
 
 
-def where_stuck(active: Tensor, window: int) -> tuple[int, int]:
-    """Return the plan step active most often in the last ``window`` states, and the latest step of the plan that was
-    active in at least 5 states.
-
-    ``active`` (T, S) is 1 where a plan step is active.
-    """
-    states = active[-window:].sum(0)
-    reached = (states >= states.max().clamp(1, _A_WHILE)).nonzero()
-    return int(states.argmax()), int(reached[-1]) if len(reached) else 0
-
-
 def _sum(episodes: list[_Episode]) -> TaskUse:
     qaf = torch.cat([episode.qaf for episode in episodes])
     steps = qaf.shape[1]
     before = torch.cat([episode.qaf[: episode.before] for episode in episodes])
-    stuck, furthest, gaps = [0] * steps, [0] * steps, []
+    stuck, gaps = [0] * steps, []
     for episode in episodes:
         holds = episode.qaf[: episode.before].any(-1).tolist()
         stretches = [(held, [*group]) for held, group in groupby(enumerate(holds), itemgetter(1))]
         gaps += [(episode.number, group[0][0], group[-1][0]) for held, group in stretches if not held]
         if not episode.success:
             active = episode.qaf.long() if episode.chosen is None else one_hot(episode.chosen, steps)
-            stuck[where_stuck(active, _LATE)[0]] += 1
-            furthest[where_stuck(active, len(active))[1]] += 1
+            stuck[int(active[-_LATE:].sum(0).argmax())] += 1
     chosen = [episode.chosen for episode in episodes if episode.chosen is not None]
     counts = torch.bincount(torch.cat(chosen), minlength=steps) if len(chosen) == len(episodes) else torch.zeros(0)
     return TaskUse(
@@ -108,7 +94,6 @@ def _sum(episodes: list[_Episode]) -> TaskUse:
         gaps=sorted(gaps),
         num_true=float(median(before.sum(-1).tolist())),
         stuck=stuck,
-        furthest=furthest,
         failed=sum(not episode.success for episode in episodes),
     )
 

@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from lw_torchrl._util.checks import Count, Scale, typed
 from lw_torchrl._util.keys import check_key
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.diagnose.attribution import attribute_failures, keys_to_attribute
+from lw_torchrl.evaluation.diagnose.attribution import attribute_failures
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.evaluation.rollout import actor_plans, rollout, suite_tasks
 from lw_torchrl.language.plans import AnyPlans
@@ -70,8 +70,8 @@ def evaluate(
         reward: the reward summed in the return, "sparse" or "dense".
         max_steps, suite, engine, num_threads: see :class:`LanguageWorldEnv`.
         workers: number of processes to split the episodes over, 1 for this process only; None for one per core if that
-            saves time (from about 300,000 time steps on two cores, 70,000 on 16). A function, a stochastic policy, a
-            policy on a GPU or a custom engine then stays in this process.
+            saves time (from about 300,000 time steps on two cores, 70,000 on 16). With None, episodes with a function,
+            a stochastic policy, a policy on a GPU or a custom engine run in this process.
         progress: show a progress bar if the evaluation takes longer than a second.
         also_record: more keys to pass to ``on_episode``, for example "qaf" or "skill_weights".
         on_episode: called with each finished episode, a named tuple of ``task``, ``episode`` (index) and ``steps``, a
@@ -142,7 +142,7 @@ def evaluate(
         evaluator=evaluator,
         env_options=env_options | {"reward": reward},
         keys=["action", ("next", "success"), ("next", "reward"), *also_record],
-        optional=(lambda env: keys_to_attribute(actor, env)) if attribute else (),
+        optional=["observation", "task_id"] if attribute else (),
         after_success=0 if stop_at_success else None,
         workers=workers,
         **run,

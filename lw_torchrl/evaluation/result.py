@@ -14,10 +14,10 @@ from typing import Any
 
 from torch import Tensor
 
-from lw_torchrl._util.checks import Count, Natural, Scale, check_value, shown, typed_fields
+from lw_torchrl._util.checks import Count, Finite, Natural, Scale, check_value, shown, typed_fields
 from lw_torchrl._util.files import AnyPath, read_json, write_json
 from lw_torchrl._util.reproducibility import package_versions
-from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure, Finite, record_from_json
+from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure, record_from_json
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1
@@ -155,7 +155,8 @@ class EvaluationResult:
             raise ValueError("failures must hold exactly one Failure for each episode without success")
         for failure in self.failures:
             if failure.seed != self.config["seed"] or failure.at >= last:
-                raise ValueError(f"failures: seed and at must agree with config, got {failure.seed} and {failure.at}")
+                got = f"got seed {failure.seed} and time step {failure.at}"
+                raise ValueError(f"failures must have the config's seed and a time step below {last}, {got}")
 
     def table(self) -> str:
         """Return a text table of each task's success rates and mean first successful time step."""
@@ -168,7 +169,7 @@ class EvaluationResult:
         return "\n".join(lines)
 
     def failure_counts(self) -> dict[str, Counter[str]]:
-        """Return, for each task, the number of failures with each cause; raise ValueError without attribution."""
+        """Return, for each task, the number of failures with each cause; raise ValueError if nothing was attributed."""
         if self.failures is None:
             raise ValueError("the result has no failures; run evaluate(..., attribute=True) to attribute failures")
         tasks = self.config["tasks"]

@@ -40,7 +40,7 @@ def rollout(
     num_envs: int | None = None,
     env_options: Mapping[str, Any],
     keys: Sequence[NestedKey] = ("action", ("next", "success"), ("next", "reward")),
-    optional: Iterable[NestedKey] | Callable[[EnvBase], Iterable[NestedKey]] = (),
+    optional: Iterable[NestedKey] = (),
     noise_scale: float = 0.0,
     after_success: int | None = None,
     place: NestedKey | None = None,
@@ -60,7 +60,7 @@ def rollout(
         episodes: a mapping from task names to episode indices.
         env_options: further arguments of :class:`LanguageWorldEnv`, such as ``seed``, ``suite`` and ``max_steps``.
         keys: keys to record in each time step; :class:`ValueError` if neither environment nor policy writes a key.
-        optional: keys to record if they are written, or a function that maps the environment to such keys.
+        optional: keys to record if they are written.
         after_success: end an episode N time steps after its first success; None to run every episode to the end.
         place: a key under which to write the position of each row's episode in ``episodes[task]``.
         first: a transform that runs before all others.
@@ -74,7 +74,7 @@ def rollout(
         chosen = [tasks[task] for task in part]
         base = LanguageWorldEnv(chosen, num_envs=num_rows(part, ROWS, num_envs), strict=True, **env_options)
         env = _with_transforms(base, first, transform_of(actor, plans), _transform_of_evaluator(evaluator))
-        more = [unravel_key(key) for key in (optional(env) if callable(optional) else optional)]
+        more = [unravel_key(key) for key in optional]
         keys_of_parts = {unravel_key(key) for each in (actor, evaluator) for key in getattr(each, "out_keys", ())}
         written = keys_of_parts | _written(env)
         recorded = list(dict.fromkeys([*map(unravel_key, keys), *(key for key in more if key in written)]))
@@ -100,8 +100,8 @@ def rollout(
     # Functions and custom engines may have side effects, which would be lost in worker processes.
     alone = not modules or callable(env_options.get("engine")) or not on_cpu or draws(actor)
     with Progress(label, sum(map(len, episodes.values())) * max_steps, "step", show=progress) as bar:
-        how: dict[str, Any] = {"workers": workers, "max_steps": max_steps, "alone": alone}
-        with closing(spread(run, episodes, bar.update, **how)) as finished:
+        limits: dict[str, Any] = {"workers": workers, "max_steps": max_steps, "largest": 2 * ROWS}
+        with closing(spread(run, episodes, bar.update, alone=alone, **limits)) as finished:
             for episode in finished:
                 on_episode(episode)
 
@@ -112,7 +112,7 @@ def _with_transforms(base: EnvBase, *transforms: Transform | None) -> EnvBase:
 
 
 def _transform_of_evaluator(evaluator: Any) -> Transform | None:
-    """Return the transform that runs after the exact answers: the evaluator, or a transform that it requires."""
+    """Return a copy of an evaluator that is a transform, the transform that a query evaluator requires, or None."""
     if isinstance(evaluator, Transform):
         return evaluator.clone()  # TorchRL does not allow two environments to share a transform
     return evaluator.transform() if isinstance(evaluator, QueryEvaluator) else None
@@ -143,7 +143,7 @@ def _checked(policy: Acts, env: EnvBase, keys: Iterable[NestedKey]) -> Acts:
 
 
 class EvaluatorInFront(nn.Module):
-    """A policy that runs an evaluator first, so that the evaluator's answers replace ``qaf``."""
+    """A policy that runs an evaluator and then an actor; the evaluator's answers replace ``qaf``."""
 
     def __init__(self, evaluator: Acts, actor: Acts) -> None:
         super().__init__()
@@ -154,7 +154,7 @@ class EvaluatorInFront(nn.Module):
 
 
 def actor_plans(actor: Any, plans: AnyPlans | None) -> Plans | None:
-    """Return the plans whose conditions are evaluated: ``plans`` or the actor's; raise ValueError if both differ."""
+    """Return the plans to evaluate: ``plans`` or, if None, the actor's; raise ValueError if both exist and differ."""
     own = plans_of(actor)
     if plans is None:
         return own

@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 from lw_torchrl._util.checks import typed
 from lw_torchrl.language.completion import completed, gripper_is, is_complete, negated, step_of
-from lw_torchrl.language.coverage import coverage_of, role_of
+from lw_torchrl.language.coverage import coverage_of, role_of, touched_point
 from lw_torchrl.language.expressions import replace_leaves
 from lw_torchrl.language.objects import GOAL, GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
 from lw_torchrl.language.queries import Clause, Query
-from lw_torchrl.language.roles import BY_HAND, Direction, Manner, StepRole, Verb, motion_of
-from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, is_free, parse_steps
+from lw_torchrl.language.roles import BY_HAND, Direction, Manner, StepRole, Verb, ignored_words, motion_of
+from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, is_free, is_obstacle, parse_steps
 from lw_torchrl.language.tasks import (
     Task,
     first_object,
@@ -30,7 +30,7 @@ MIN_COVERAGE = 0.75
 """The minimum fraction of typical states that a plan must cover to keep its own conditions."""
 Source = Literal["plan", "completed", "fallback"]
 SOURCES = {"plan": "its own steps", "completed": "completed", "fallback": "replaced by the fallback plan"}
-"""The wording of each source for a reader."""
+"""A short description, for printing, of each source of a canonical plan's steps."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class CanonicalReport:
     """A report on how :func:`canonical_plan` parses a plan.
 
     ``source`` is "plan" if the plan keeps its own steps. ``source`` is "completed" if these steps do not cover the
-    typical states: the plan keeps its motion, objects and direction, but gets standard conditions. ``source`` is
-    "fallback" if the plan has no motion and is replaced by the fallback plan.
+    typical states: standard steps are added, and the plan's own conditions are restricted or extended where the
+    standard ones differ. ``source`` is "fallback" if the plan has no motion and is replaced by the fallback plan.
     """
 
     written: ConditionalPlan
@@ -50,15 +50,18 @@ class CanonicalReport:
     is_read: tuple[bool, ...]  # whether each step of ``written`` is in ``read``
 
     def notes(self) -> list[dict[str, Any]]:
-        """Return a JSON row for each step of ``written``, then one for each step that replaces the plan's own.
+        """Return a JSON row for each step of ``written``, then one for each step that replaces the plan's steps.
 
         The keys are ``written`` (None for an added step); ``skill``, ``verb``, ``moved``, ``target`` and ``condition``
-        (None for a step that was left out); and ``seen``, whether policies see the step.
+        (None for a step that was left out); ``seen``, whether policies see the step; and, if the skill has words that
+        are ignored, such as "three times" or "without touching it", these words as ``ignored``.
         """
 
         def note(step: PlanStep, seen: bool) -> dict[str, Any]:
             role = role_of(step)
             parsed = {"skill": step.skill, "verb": role.verb, "moved": role.moved, "target": role.target}
+            if ignored := ignored_words(role.written, self.plan.definition):
+                parsed["ignored"] = ignored
             return {"written": role.written or None, **parsed, "condition": str(step.condition), "seen": seen}
 
         is_own, read = self.source == "plan", iter(self.read)
@@ -76,13 +79,15 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
     Each step gets a verb, an object that moves, a target and a direction (:class:`StepRole`), which are inferred from
     the step's words, its condition and the task's objects only. If the object that the hand touches has a named point,
     this point replaces the object. A plan whose conditions miss typical states, or that moves an object without
-    grasping it first, keeps its motion, objects and direction, but gets standard conditions. A plan without any motion
-    is replaced by :func:`fallback_plan`. A plan that already has roles is not parsed again.
+    grasping it first, is completed: it gets the missing steps, and its own conditions are changed where they differ
+    from standard conditions. A plan without any motion is replaced by :func:`fallback_plan`. A plan that already has
+    roles is not parsed again.
 
     Args:
         plan: a plan in free-form English.
-        fallback: append the steps of the fallback plan, with ``fallback=True`` in their roles: policies try these steps
-            when the plan makes no progress, and carry or slide the object in turn. A plan that has them is unchanged.
+        fallback: append the steps of the fallback plan, with ``fallback=True`` in their roles. Policies try these steps
+            when the plan makes no progress, and alternate between carrying and sliding the object. A plan that already
+            has fallback steps is unchanged.
 
     Example:
         >>> import lw_torchrl as lw
@@ -103,7 +108,7 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
         carry = step_of(slide.condition, replace(role_of(slide), verb="carry"))
         verbs = {role_of(step).verb for step in plan.steps}
         slid = "move" in verbs or verbs.isdisjoint(("carry", "push", "pull"))
-        other = (*other[:-1], carry, slide) if slid else (*other, carry)  # first the motion that the plan did not try
+        other = (*other[:-1], carry, slide) if slid else (*other, carry)  # try first the motion that the plan lacks
     steps = [replace(step, reason="fallback", role=replace(role_of(step), fallback=True)) for step in other]
     return replace(plan, steps=(*plan.steps, *steps))
 
@@ -130,7 +135,7 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     motion = _final_motion(read)
     source: Source
     if is_complete(task, read) and coverage_of(task, read) >= MIN_COVERAGE:
-        source, steps = "plan", read
+        source, steps = "plan", _past_obstacles(task, read)
     elif motion is not None:
         source, steps = "completed", completed(task, read, motion)
     else:
@@ -141,6 +146,7 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
         written = role_of(step).written
         reasons = [SOURCES[source]] if number == 0 else []
         reasons += [f"as written: {written}"] if written and written != step.skill else []
+        reasons += [f"left out: {words}"] if (words := ignored_words(written, task)) else []
         explained.append(replace(step, reason="; ".join(reasons)))
     canonical = ConditionalPlan(plan.task, tuple(explained), task)
     return CanonicalReport(plan, canonical, source, read, left_out, tuple(map(_has_role, parsed)))
@@ -197,7 +203,7 @@ def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> t
 
 
 def _approach(each: ParsedStep, purpose: ParsedStep | None) -> tuple[Verb, Manner, Direction | None]:
-    """Return (verb, manner, direction) of a step that prepares for the step ``purpose``; None stands for a grasp."""
+    """Return (verb, manner, direction) of a step that prepares the step ``purpose``; None means a grasp."""
     verb = "descend" if each.verb == "beside" else each.verb
     if purpose is None:
         return verb, "grasp", None
@@ -256,8 +262,19 @@ def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
     return direct
 
 
+def _past_obstacles(task: Task, steps: Sequence[PlanStep]) -> tuple[PlanStep, ...]:
+    """Redirect "move the gripper over the wall" to the point that the hand touches behind the wall."""
+    roles = [role_of(step) for step in steps]
+    return tuple(
+        step_of(step.condition, replace(role, target=touched_point(task, roles)))
+        if role.verb in BY_HAND and is_obstacle(role.target)
+        else step
+        for step, role in zip(steps, roles, strict=True)
+    )
+
+
 def _final_motion(steps: Sequence[PlanStep]) -> StepRole | None:
-    """Return the motion that ends at the goal, in a plan in any order; otherwise the last motion."""
+    """Return the motion that ends at the goal, wherever it is in the plan; otherwise the last motion."""
     moving = [step for step in steps if role_of(step).verb in ("carry", "move") and not is_free(step)]
     to_goal = [step for step in moving if role_of(step).target == GOAL]
     return motion_of([role_of(step) for step in to_goal or steps])

@@ -1,16 +1,16 @@
-"""Completion of an underspecified plan: standard steps carry out its motion on the object that it touches."""
+"""Complete an underspecified plan with the standard steps for its motion, such as approaching and grasping."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
-from lw_torchrl.language.coverage import moves_before_grasp, role_of, touched_point
+from lw_torchrl.language.coverage import moves_before_grasp, role_of, touched_point, true_around
 from lw_torchrl.language.expressions import Expression, all_of, any_of, leaves, negate
 from lw_torchrl.language.objects import GOAL, GRIPPER
 from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.queries import Clause, Query
-from lw_torchrl.language.roles import VECTORS, Direction, Manner, StepRole, Verb, motion_of
+from lw_torchrl.language.roles import BY_HAND, VECTORS, Direction, Manner, StepRole, Verb, motion_of
 from lw_torchrl.language.step_parser import is_free, is_obstacle
 from lw_torchrl.language.tasks import Task, object_of, same_object
 
@@ -30,7 +30,7 @@ def negated(query: Query) -> Query:
 def is_complete(task: Task, steps: Sequence[PlanStep]) -> bool:
     """Return whether a plan has a motion and, if the motion needs a grasp, first approaches and grasps the object.
 
-    The list shows what comes first, or else the conditions: no step moves the object before it is grasped.
+    The order of the steps or their conditions must show that no step moves the object before the grasp.
     """
     roles = [role_of(step) for step in steps]
     verbs = [role.verb for role in roles]
@@ -46,13 +46,16 @@ def is_complete(task: Task, steps: Sequence[PlanStep]) -> bool:
 
 
 def completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple[PlanStep, ...]:
-    """Build the steps with standard conditions that carry out ``motion`` on the object that the given steps touch."""
-    roles = [role_of(step) for step in steps]
+    """Build the steps that carry out ``motion`` on the object that the given steps touch.
+
+    Each given step replaces the standard step with the same action. Its condition is changed only where it is wrong.
+    """
     if motion.manner == "reach":
         return tuple(steps)
+    roles, lifted = [role_of(step) for step in steps], _lifted(task, steps)
     if any(role.verb == "carry" and (role.moved, role.target) == (motion.moved, motion.target) for role in roles):
         motion = replace(motion, verb="carry")
-    point = touched_point(task, roles)
+    point, written = touched_point(task, roles), motion
     above, near, over = (gripper_is(relation, point) for relation in ("above", "near", "vertically aligned with"))
     away = negated(near)
 
@@ -71,30 +74,80 @@ def completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple[
             motion = replace(motion, moved=moved)
         if motion.verb == "move" and steps and any(map(is_obstacle, task.object_names)):
             motion = replace(motion, verb="carry")
-        # Around a wide object fingers are never closed. A layout with its own threshold knows its objects.
+        # Fingers around a wide object do not close, but are no longer wide open. If a layout sets a threshold for
+        # "open", the threshold suits its objects.
         opened = gripper_is("open" if "open" in task.layout.thresholds else "wide open")
         held = Query((*near.clauses, *negated(opened).clauses))
-        return (
+        standard = (
             by_hand("approach", "grasp", negated(above), away),
             by_hand("descend", "grasp", above, away),
             by_hand("close", "grasp", near, opened),
-            *(_own_motions(task, steps, held) or [step_of(held, motion)]),
+            *(_own_motions(task, lifted, held) or [step_of(held, motion)]),
         )
+        return _with_own(task, lifted, standard, written)
     way, motion = motion.direction, replace(motion, target=point)
     if motion.manner == "press":
-        return by_hand("approach", "press", negated(over), way=way), step_of(over, motion)
-    if way == "away":
+        standard = by_hand("approach", "press", negated(over), way=way), step_of(over, motion)
+    elif way == "away":
         level = gripper_is("forward aligned with", point)
-        return by_hand("beside", "push", negated(level), way=way), step_of(level, motion)
-    approach = by_hand("approach", "push", negated(over), way=way), by_hand("beside", "push", over, away, way=way)
-    return *approach, step_of(near, motion)
+        standard = by_hand("beside", "push", negated(level), way=way), step_of(level, motion)
+    else:
+        approach = by_hand("approach", "push", negated(over), way=way), by_hand("beside", "push", over, away, way=way)
+        standard = *approach, step_of(near, motion)
+    return _with_own(task, lifted, standard, written)
+
+
+def _with_own(
+    task: Task, steps: Sequence[PlanStep], standard: Sequence[PlanStep], motion: StepRole
+) -> tuple[PlanStep, ...]:
+    """Replace each standard step by the plan's steps with the same action, and complete the conditions of these.
+
+    If a plan's step is active at a hand position at which the standard step is not, the clauses of the standard
+    condition that are false there are added. If none of the plan's steps is active where the standard step is, the
+    condition of the last one is extended to be true there.
+    """
+    several = sum(role_of(step).verb in ("carry", "move") for step in standard) > 1  # already from the plan
+
+    def is_same(role: StepRole, usual: StepRole) -> bool:
+        if usual.verb in (*BY_HAND, "close"):
+            return (role.verb, role.target) == (usual.verb, usual.target)
+        moves = role.verb in ("carry", "move", "push", "pull") and not several
+        return moves and (role.moved, role.target, role.direction) == (motion.moved, motion.target, motion.direction)
+
+    usual, point = [step.condition for step in standard], touched_point(task, list(map(role_of, steps)))
+    own = [(n, step) for n, each in enumerate(standard) for step in steps if is_same(role_of(step), role_of(each))]
+    last = {n: at for at, (n, _) in enumerate(own)}
+    kept: list[Query] = []
+    for n, step in own:
+        clauses: list[Clause] = []
+        for clause in reversed(usual[n].clauses):
+            three = Query(all_of([step.condition.expression, *clauses])), usual[n], Query((clause,))
+            if any(0 in active and not {1, 2} & active for active in true_around(task, point, three)):
+                clauses.append(clause)
+        kept.append(Query(all_of([step.condition.expression, *clauses])))
+    around = list(true_around(task, point, [*usual, *kept]))
+    left_open = {n for active in around if max(active, default=0) < len(usual) for n in active}
+    seen = {at - len(usual) for active in around for at in active}
+    needed = left_open | {n for n, each in enumerate(standard) if role_of(each).written}
+    made = {n: [standard[n]] for n in needed - {*last}}
+    for at, ((n, step), condition) in enumerate(zip(own, kept, strict=True)):
+        is_possible = at in seen or condition == step.condition
+        if last[n] == at and n in left_open:
+            condition = Query(any_of([condition.expression, usual[n].expression])) if is_possible else usual[n]
+        elif not is_possible:
+            continue
+        role = replace(role_of(standard[n]), written=role_of(step).written, confidence=role_of(step).confidence)
+        made.setdefault(n, []).append(step_of(condition, role))
+    return tuple(step for n in sorted(made) for step in made[n])
 
 
 def _own_motions(task: Task, steps: Sequence[PlanStep], held: Query) -> list[PlanStep]:
-    """Return the plan's own motions of a held object, if there are several, with ``held`` instead of their conditions
-    on the gripper. The last one is also active where no other is.
+    """Return the plan's motions of a held object, if there are several; otherwise return an empty list.
+
+    ``held`` replaces the parts of their conditions that mention the gripper. The last motion is also active wherever no
+    other motion is.
     """
-    moving = _lifted(task, [step for step in steps if role_of(step).verb in ("carry", "move") and not is_free(step)])
+    moving = [step for step in steps if role_of(step).verb in ("carry", "move") and not is_free(step)]
     distinct = {(role_of(step).moved, role_of(step).target, role_of(step).direction) for step in moving}
     if len(distinct) < 2 or any(map(is_obstacle, task.object_names)):  # an object is lifted over an obstacle
         return []
@@ -106,15 +159,15 @@ def _own_motions(task: Task, steps: Sequence[PlanStep], held: Query) -> list[Pla
     ]
 
 
-def _lifted(task: Task, steps: Sequence[PlanStep]) -> list[PlanStep]:
-    """Turn "lift the wrench up" into a carry to the target of the next motion of the same object, if there is one."""
+def _lifted(task: Task, steps: Sequence[PlanStep]) -> Sequence[PlanStep]:
+    """Replace "lift the wrench up" by a step that carries the wrench to the target of its next motion, if any."""
     direct = list(steps)
     for number, step in enumerate(steps):
         role = role_of(step)
         others = (role_of(other) for other in (*steps[number + 1 :], *steps[:number]))
         same = (other for other in others if other.direction is None and same_object(task, other.moved, role.moved))
         after = next(same, None)
-        if role.direction == "up" and after is not None:
+        if role.verb == "move" and role.direction == "up" and after is not None:
             direct[number] = step_of(step.condition, replace(after, verb="carry", written=role.written))
     return direct
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from lw_torchrl.language.expressions import Expression, all_of, any_of, negate, once
 
 CONNECTIVES = ("and", "or", "nor", "unless", "either", "neither", "both")
-"""The words that join conditions, which no name of an object or a relation may contain."""
+"""The words that join conditions. Names of objects and relations must not contain them."""
 OPENERS = ("(", "either", "both", "neither")
 """The words that open a group of conditions."""
 
@@ -23,10 +23,10 @@ class _Group:
     negated_inside: bool = False  # "once not (...)"
     parts: list[Expression] = field(default_factory=list)  # joined by "and"
     alternatives: list[Expression] = field(default_factory=list)  # joined by "or"
-    exceptions: list[Expression] = field(default_factory=list)  # a condition, and those after "unless"
+    exceptions: list[Expression] = field(default_factory=list)  # the main condition, then those after each "unless"
 
     def end(self, joined: list[Expression]) -> None:
-        """End a conjunction or disjunction, which becomes a part of ``joined``."""
+        """End the current conjunction; if ``joined`` is ``exceptions``, also end the current disjunction."""
         if self.parts:
             self.alternatives.append(all_of(self.parts))
             self.parts = []
@@ -53,10 +53,10 @@ _PARTNERS = {"neither": "nor", "either": "or", "both": "and"}
 
 
 def repeat_predicate(words: Sequence[str], relations: Collection[str]) -> list[str]:
-    """Repeat a predicate that two subjects share, so that each operand is a clause.
+    """Repeat a predicate that two subjects share, so that each operand is a complete clause.
 
     Args:
-        relations: the words that a predicate begins with.
+        relations: the words with which a predicate can begin.
 
     Example:
         >>> " ".join(repeat_predicate("neither a nor b is near c".split(), {"is", "near"}))
@@ -79,7 +79,7 @@ def repeat_predicate(words: Sequence[str], relations: Collection[str]) -> list[s
     return words
 
 
-# The groups that a word ends; a parenthesis and the end of the text end all but "(".
+# The groups that each word closes. ")" and the end of the text close all groups except those opened by "(".
 _ENDS = {"and": ("neither",), "or": ("both", "neither"), "nor": ("both", "either")}
 
 
@@ -95,8 +95,9 @@ def parse_words(
 
     Args:
         words: words and parentheses.
-        operand: a function that parses the words of an operand, in the order of the text; None to skip the operand.
-        fail: a function that makes the error for word number n (from 0), given what was expected there.
+        operand: a function that parses the words of an operand, or returns None to skip the operand. The function is
+            called in the order of the text.
+        fail: a function that returns the error to raise, given the index of the faulty word and what was expected.
     """
     stack, pending, negated, expects = [_Group("", False)], list[str](), False, True
     for number, given in enumerate((*words, "")):

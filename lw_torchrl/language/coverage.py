@@ -1,9 +1,10 @@
-"""The coverage of a plan: the fraction of typical states in which its active steps do what its motion needs."""
+"""The coverage of a plan: the fraction of typical states in which the plan's active steps suit the plan's motion."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from importlib.resources import files
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ def role_of(step: PlanStep) -> StepRole:
 
 
 def touched_point(task: Task, roles: Sequence[StepRole]) -> str:
-    """Return the point that the hand touches: the target of the first step other than "approach", else of any step."""
+    """Return the point that the hand touches: the target of the first hand motion, preferably not of an approach."""
     hands = [role for role in roles if role.moved == GRIPPER != role.target and not is_goal(task, role.target)]
     hands = [role for role in hands if not is_obstacle(role.target)] or hands
     hand = min(hands, key=lambda role: role.verb == "approach", default=None)
@@ -43,12 +44,12 @@ def _has_sides(roles: Sequence[StepRole]) -> bool:
 
 
 def coverage_of(task: Task, steps: Sequence[PlanStep]) -> float:
-    """Return the fraction of typical states of the plan's motion in which the active steps do what the motion needs."""
+    """Return the fraction of typical states in which the plan's active steps are right for the plan's motion."""
     roles = [role_of(step) for step in steps]
     motion = motion_of(roles)
     if motion is None:
         return 0.0
-    # Reaching and pushing from several sides have no typical states.
+    # No typical states are defined for reaching and for pushing from several sides.
     if motion.manner == "reach" or _has_sides(roles):
         return 1.0
     manner = "pull" if motion.verb == "pull" else motion.manner
@@ -65,6 +66,9 @@ _TYPICAL = {
     motion: [(offset, opening, lift, {*verbs.split()}) for hands, opening, lift, verbs in rows for offset in hands]
     for motion, rows in _MOTIONS.items()
 }
+# Gripper openings and hand positions relative to the touched point (metres), some at the relations' thresholds.
+_PLANE = ((0.0, 0.0), (0.035, 0.01), (-0.01, -0.035), (-0.05, 0.02), (0.02, 0.07), (0.13, -0.1))
+_AROUND = _PLANE, (-0.01, 0.01, 0.034, 0.08), (1.0, 0.8, 0.3)
 
 
 def _coverage(task: Task, point: str, motion: str, steps: Sequence[tuple[Query, Verb]]) -> float:
@@ -82,8 +86,15 @@ def _active(
         yield {verb for query, verb in steps if _holds(query, task, state)}, verbs
 
 
+def true_around(task: Task, point: str, conditions: Sequence[Query]) -> Iterator[set[int]]:
+    """Yield the indices of the true conditions for each of several hand positions around a point."""
+    for (x, y), z, opening in product(*_AROUND):
+        state = _state(task, point, (x, y, z), opening, 0.0)
+        yield {number for number, query in enumerate(conditions) if _holds(query, task, state)}
+
+
 def moves_before_grasp(task: Task, steps: Sequence[PlanStep]) -> bool:
-    """Return whether a step that moves an object is active in a typical state in which the hand does not hold it."""
+    """Return whether a step that moves an object is active in a typical state in which the hand holds no object."""
     point = touched_point(task, [role_of(step) for step in steps])
     moving: list[tuple[Query, Verb]] = [
         (step.condition, "move") for step in steps if role_of(step).verb in ("carry", "move")
@@ -122,7 +133,7 @@ def _holds(query: Query, task: Task, state: _Floats) -> bool:
 
 
 def _is_true(clause: Clause, task: Task, state: _Floats) -> bool:
-    """Evaluate a clause without torch, in the precision and the order of operations of QueryProgram."""
+    """Evaluate a clause without torch, with the same precision and order of operations as QueryProgram."""
     second, shift = _floats((0.0, 0.0, 0.0)), np.zeros(3)
     if clause.predicate in STATES:
         first = _floats((0.0, 0.0, state[task.openings[clause.subject]]))

@@ -1,4 +1,4 @@
-"""Boolean expressions over hashable leaves, in a normal form whose equal parts are shared."""
+"""Boolean expressions over hashable leaves, in a normal form in which equal parts are the same object."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from weakref import WeakValueDictionary
 
 Kind = Literal["leaf", "all", "any"]
 Result = TypeVar("Result")
-MOST_PARTS = 1_000  # of one conjunction or disjunction; flattening a chain takes the square of its length
+MOST_PARTS = 1_000  # maximum number of parts of a conjunction or disjunction; flattening n parts takes O(n²) time
 
 
 class _Node:
@@ -26,13 +26,14 @@ class _Node:
 class Expression(NamedTuple):
     """A boolean expression: a leaf, its negation, or a conjunction or disjunction of expressions.
 
-    :func:`all_of`, :func:`any_of` and :func:`negate` make expressions in normal form. Only leaves are negated; no part
-    of a conjunction is itself a conjunction, a repetition or the negation of other parts, or a disjunction with one of
-    the other parts; the same holds for disjunctions. Parts keep their order. Two expressions are equal if they have the
+    :func:`all_of`, :func:`any_of` and :func:`negate` return expressions in normal form. Only leaves are negated. No
+    part of a conjunction is itself a conjunction, repeats or negates other parts, or is a disjunction that contains
+    another part; the same holds for disjunctions. Parts keep their order. Two expressions are equal if they have the
     same normal form.
 
-    Equal parts exist once in memory, and functions of this module visit each part once. So an expression takes linear
-    time and memory, even if its text has exponential length. The depth is not limited.
+    Equal parts are stored once, and the functions of this module visit each part once. Time and memory are therefore
+    linear in the number of distinct parts, even if the written expression is exponentially long. The depth is not
+    limited.
 
     Example:
         >>> expression = any_of([all_of(["near", negate("closed")]), "held"])
@@ -114,7 +115,7 @@ def negate(value: Any) -> Expression:
 
 
 def all_of(parts: Iterable[Any]) -> Expression:
-    """Return the conjunction of expressions or leaves; :data:`TRUE` without any.
+    """Return the conjunction of expressions or leaves; :data:`TRUE` if there are none.
 
     Raises:
         ValueError: the conjunction has more than 1,000 parts.
@@ -126,7 +127,7 @@ def all_of(parts: Iterable[Any]) -> Expression:
         else:
             distinct[part] = None
         if len(distinct) > MOST_PARTS:
-            raise ValueError(f"a condition must join at most {MOST_PARTS} others by 'and' or 'or'; split the condition")
+            raise ValueError(f"a condition must join at most {MOST_PARTS} parts by 'and' or 'or'; split the condition")
     either = [part for part in distinct if part.node.parts is not None]
     if len({part.node for part in distinct}) < len(distinct):
         return FALSE  # an expression and its negation have the same node
@@ -139,13 +140,13 @@ def all_of(parts: Iterable[Any]) -> Expression:
                 del distinct[part]
     if len(distinct) == 1:
         return next(iter(distinct))
-    # The key names parts by id, so that it does not keep them alive; the node does, as long as it exists.
+    # The key holds the ids of the parts instead of the parts, so that only the node keeps the parts in memory.
     key = tuple((id(part.node), part.negated) for part in distinct)
     return Expression(_shared(key, None, tuple(distinct)), False)
 
 
 def any_of(parts: Iterable[Any]) -> Expression:
-    """Return the disjunction of expressions or leaves; :data:`FALSE` without any. Errors as in :func:`all_of`."""
+    """Return the disjunction of expressions or leaves; :data:`FALSE` if there are none. See :func:`all_of`."""
     return negate(all_of(map(negate, parts)))
 
 
@@ -157,7 +158,7 @@ FALSE = negate(TRUE)
 
 @dataclass(frozen=True)
 class Once:
-    """A leaf that remembers: true from the first step of an episode in which ``condition`` was true.
+    """A latch: a leaf that is true from the first time step of an episode at which ``condition`` is true.
 
     The condition may contain other latches. :func:`once` makes latches in normal form.
     """
@@ -174,7 +175,7 @@ class Once:
 
     @cached_property
     def mentions(self) -> int:
-        """How often the written condition mentions a leaf."""
+        """The number of leaves in the written condition, counting repetitions."""
         return count_mentions(self.condition)
 
 
@@ -247,7 +248,7 @@ def replace_leaves(expression: Expression, function: Callable[[Any], Any]) -> Ex
 def literals(expression: Expression) -> tuple[Expression, ...]:
     """Return the distinct leaves and negated leaves, in the order of their first mention.
 
-    A latch is not a leaf here; the leaves of its condition are.
+    Latches are left out, but the leaves of their conditions are included.
     """
     found: dict[Expression, None] = {}
 
@@ -265,7 +266,9 @@ def leaves(expression: Expression) -> tuple[Any, ...]:
 
 
 def implied(expression: Expression) -> tuple[Expression, ...]:
-    """Return the leaves and negated leaves that are true wherever the expression is true, as far as its form shows.
+    """Return leaves and negated leaves that are true wherever the expression is true.
+
+    Only those are returned that follow from the form of the expression, without a search over truth values.
 
     Example:
         >>> implied(all_of(["a", any_of([all_of([negate("b"), "c"]), negate("b")])]))
@@ -284,7 +287,7 @@ def implied(expression: Expression) -> tuple[Expression, ...]:
 
 
 def count_mentions(expression: Expression) -> int:
-    """Return how often the written expression mentions a leaf, without writing the expression."""
+    """Return the number of leaves in the written expression, counting repetitions, without writing the expression."""
 
     def visit(each: Expression, parts: list[int]) -> int:
         if each.kind != "leaf":

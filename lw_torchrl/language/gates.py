@@ -1,8 +1,8 @@
-"""Conditions as gates: the expressions of many tasks as index tensors, which are evaluated for a batch at once.
+"""Compile the expressions of many tasks to gates: index tensors that are evaluated for a whole batch at once.
 
-A gate is the conjunction of values and negated values: of leaves, or of other gates. A disjunction is a negated gate.
-Gates of the same level, which depend only on lower levels, are evaluated together; parts that expressions share are one
-gate. The gates of the last level are the expressions.
+A gate is the conjunction of leaves, other gates, and the negations of either. A disjunction is a negated gate. A part
+that several expressions share becomes a single gate. The gates of a level depend only on lower levels and are evaluated
+together. The last level has one gate for each expression.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from torch import Tensor, nn
 from lw_torchrl.language.expressions import FALSE, Expression, fold, negate
 
 Truth = Literal["exact", "min-max", "product"]
-"""How gates combine values: bool; or logits, of which a conjunction has the smallest ("min-max") or the logit of the
-product of the probabilities ("product"). A negation has the negative logit."""
+"""How gates combine values. With "exact", values are bool. Otherwise values are logits, and NOT flips the sign. AND is
+then the minimum of the logits ("min-max"), or the logit of the product of the probabilities ("product")."""
 
 
 def inner_gates(expressions: Iterable[Expression]) -> dict[Expression, int]:
     """Return the conjunctions inside expressions, each with its level from 0, ordered by level.
 
-    An expression that is a disjunction contains the negation of a conjunction; a conjunction does not contain itself.
+    The conjunction whose negation represents a disjunction is included. A whole expression is not.
     """
     levels: dict[Expression, int] = {}
     for expression in expressions:
@@ -45,8 +45,11 @@ Shapes = tuple[tuple[int, int, int], ...]
 
 
 class Gates(NamedTuple):
-    """The gates of T tasks. ``shapes`` has (J, K, G) for each level: G gates of K operands of J values each, where an
-    operand is the conjunction of its values, or the negation of it."""
+    """The gates of T tasks.
+
+    ``shapes`` holds (J, K, G) for each level: the level has G gates with K operands each, and an operand is the
+    conjunction of J values or the negation of such a conjunction.
+    """
 
     inputs: Tensor  # (T, sum of J*K*G) int64, indices into the values and the gates of lower levels
     negated: Tensor  # (T, sum of K*G) bool, true for negated operands
@@ -65,10 +68,10 @@ def compile_gates(
         tasks: the expressions of each task. Shorter lists are padded with expressions that are never true.
         leaves: for each task, a function from a leaf or its negation to (indices of its values, negated).
         size: the number of values of a task, including the value that is always true.
-        true: the index of this value.
+        true: the index of the value that is always true.
     """
     inner = [inner_gates(expressions) for expressions in tasks]
-    places: list[dict[Expression, int]] = [{} for _ in tasks]  # the place of each gate among the values
+    places: list[dict[Expression, int]] = [{} for _ in tasks]  # the index of each gate's value
 
     def operands(task: int, parts: Iterable[Expression]) -> list[Operand]:
         return [leaves[task](part) if part.kind == "leaf" else ([places[task][negate(part)]], True) for part in parts]
@@ -92,10 +95,13 @@ def compile_gates(
 
 
 def _tables(rows: list[list[list[Operand]]], true: int) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
-    """Return the inputs, the negated operands and the shape (J, K, G) of a level, given each task's gates' operands."""
+    """Return the inputs, the negated operands and the shape (J, K, G) of a level.
+
+    ``rows`` holds, for each task and each gate, the gate's operands.
+    """
     count = max(map(len, rows))
-    width = max(1, *(len(gate) for own in rows for gate in own))
-    depth = max(1, *(len(values) for own in rows for gate in own for values, _ in gate))
+    width = max([1, *(len(gate) for own in rows for gate in own)])
+    depth = max([1, *(len(values) for own in rows for gate in own for values, _ in gate)])
     never: list[Operand] = [([true], True)]
     full = [
         [[*gate, *[([true], False)] * (width - len(gate))] for gate in own + [never] * (count - len(own))]

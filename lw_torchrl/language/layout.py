@@ -35,7 +35,8 @@ class Slot:
 class Layout:
     """The meaning of each number in observations and actions, shared by all tasks of a suite.
 
-    Positions are in metres (x to the right, y away from the robot, z up from the table); y and z follow the index of x.
+    Positions are in metres (x to the right, y away from the robot, z up from the table). The index of a position is
+    that of its x; y and z follow.
     Scripted skills, ``RandomYaw`` and ``TransferredActor`` need a layout with a ``displacement`` of the hand. In
     scripted skills an effort of 1 closes the gripper; in actions and data, ``closes`` is the sign of the closing
     effort.
@@ -51,8 +52,8 @@ class Layout:
     size: Count  # the length D of an observation
     hand: Natural  # index of the gripper's x
     opening: Natural  # index of the gripper's opening, from 0 (closed) to 1 (open)
-    things: tuple[Slot, ...]  # a task's objects in order; an object that a task lacks is zeros
-    goal: Natural  # index of the x of the task's target, which has no value in the previous step
+    things: tuple[Slot, ...]  # a task's objects in order; the numbers of an object that the task lacks are zero
+    goal: Natural  # index of the target's x; observations lack the target's position in the previous time step
     past: Natural | None = None  # offset from a number's index to its value in the previous time step
     action_size: Count = 4  # the length A of an action; each number is in [-1, 1]
     displacement: Natural | None = 0  # index of the hand's displacement along x; None without a displacement
@@ -61,7 +62,7 @@ class Layout:
     closes: Literal[1, -1] = 1  # sign of the effort that closes the gripper
     binary_gripper: bool = False  # whether the gripper only opens or closes fully, within a few time steps
     closes_above: float = 0.3  # effort above which a binary gripper closes
-    thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)  # relation to the suite's threshold (m)
+    thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)  # the suite's threshold (m) by relation
 
     def __post_init__(self) -> None:
         layout = f"layout {self.name!r}"
@@ -75,7 +76,7 @@ class Layout:
             raise ValueError(f"{layout} uses index {twice[0]} of the observation more than once")
         for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):
             if index is not None and index + width > self.action_size:
-                raise ValueError(f"{name} of {layout} must fit {self.action_size} action numbers, got index {index}")
+                raise ValueError(f"{name} of {layout} must be within {self.action_size} action numbers, got {index}")
         if self.displacement is not None and self.gripper in range(self.displacement, self.displacement + 3):
             raise ValueError(f"gripper of {layout} must not be an index of the displacement, got {self.gripper}")
         object.__setattr__(self, "thresholds", ReadOnlyDict(dict(self.thresholds)))
@@ -90,13 +91,13 @@ class Layout:
 
     @cached_property
     def positions(self) -> tuple[slice, ...]:
-        """The slices of the current positions: hand, objects, goal."""
+        """The slices with the current positions: hand, objects, goal."""
         starts = (self.hand, *(thing.position for thing in self.things), self.goal)
         return tuple(slice(start, start + 3) for start in starts)
 
     @cached_property
     def all_positions(self) -> tuple[slice, ...]:
-        """The slices of all positions, in the current and the previous time step."""
+        """The slices with all positions, in the current and the previous time step."""
         return (*self.positions, *self._past(self.positions[:-1]))
 
     @cached_property
@@ -151,4 +152,4 @@ def places(part: slice) -> tuple[int, ...]:
 
 
 METAWORLD = Layout("metaworld", 39, hand=0, opening=3, things=(Slot(4, 7), Slot(11, 14)), goal=36, past=18, reach=0.01)
-"""The layout of Meta-World's 39-number observations; in a task with one object, the second object is zeros."""
+"""The layout of Meta-World's 39-number observations. In a task with one object, the second object's numbers are 0."""

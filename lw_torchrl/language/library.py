@@ -1,4 +1,4 @@
-"""Skills of skills: programs that other programs call by name, such as "grasp the mug"."""
+"""Composite skills: programs that other programs call by name, such as "grasp the mug"."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ LIBRARY: Mapping[str, str] = read_toml(files("lw_torchrl.language") / "data" / "
 
 
 def expand(program: Node, library: Mapping[str, str], read: Callable[[str], Node], calls: tuple[str, ...] = ()) -> Node:
-    """Replace each action that calls a program of a library by that program.
+    """Replace each action that calls a program of the library with that program.
 
-    A name is a text with placeholders; "grasp {object}" is the name of "grasp the mug". In the program of that name,
-    the action "grasp the mug" is the skill itself.
+    The name of a program may have placeholders: the action "grasp the mug" calls the program "grasp {object}". Inside
+    that program, the same action is the plain skill instead of another call.
 
     Args:
         library: texts of programs by name, with the same placeholders.
@@ -61,5 +61,6 @@ def _called(action: Action, library: Mapping[str, str], read: Callable[[str], No
             raise ProgramError(f"a program must not call itself, got {' -> '.join([*calls, action.text])}")
         for key, words in match.groupdict().items():
             text = text.replace(f"{{{key}}}", words)
-        return Sequence((expand(read(text), library, read, (*calls, action.text)),))  # the next action waits for it
+        # Put the program into a sequence, so that the next action waits until the program is done.
+        return Sequence((expand(read(text), library, read, (*calls, action.text)),))
     return action

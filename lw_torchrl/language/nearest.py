@@ -15,6 +15,7 @@ from lw_torchrl._util.checks import check_choice, typed
 from lw_torchrl.language.connectives import parse_words
 from lw_torchrl.language.expressions import Expression
 from lw_torchrl.language.objects import GRIPPER, WORDS
+from lw_torchrl.language.polarity import affirmed, agree, instruction, plain_negations, poles, rests, source_of
 from lw_torchrl.language.queries import (
     Clause,
     Query,
@@ -23,23 +24,27 @@ from lw_torchrl.language.queries import (
     read_query,
     split_words,
 )
-from lw_torchrl.language.relations import PREDICATES
+from lw_torchrl.language.relations import PREDICATES, STATES, TOUCHING
+from lw_torchrl.language.roles import has_certain_target, mark_objects
 from lw_torchrl.language.skills import ScriptedSkill, SkillError, Skills, load_skills, skills_for
-from lw_torchrl.language.tasks import Task, get_task
+from lw_torchrl.language.tasks import Task, get_task, same_object
 from lw_torchrl.language.text import sentence_vectors
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-_NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
 # Words that do not affect the choice of a query.
 _EMPTY = frozenset(("the", "a", "an", "is", "are", "be", "does", "do", "did", "has", "have", "robot's", "robot"))
 _JOINS = frozenset(("or", "nor", "unless", "either", "neither", "both", "("))
 _LONGEST = 400  # maximum length (characters) of a text to map
 _MOST_CLAUSES = 8  # maximum number of clauses of a condition to map
 _MOST_COMPARED = 64  # maximum number of texts to map per answer, which bounds the decoding time
+_LEAST_RATIOS = (60, 80)  # minimum similarity, in percent, of a written word and a word for a state or for contact
 LIMIT, SKILL_LIMIT = 0.4, 0.7  # maximum distance of a condition and of a skill; see docs/language-models.md
+_PLACES = f"(?:{'|'.join(WORDS['canonical']['place'])})"
+_HANDS = frozenset(WORDS["canonical"]["hands"]) - {"gripper"}
+_A_HAND = re.compile(rf"\b(?:{'|'.join(sorted(map(re.escape, _HANDS), key=len, reverse=True))})\b")
 _TARGETS = ("target location", "reach target")
 _TARGET = re.compile(
     r"\b(?:the\s)?(?:reach\s)?(?:goal|target)(?:\s(?:location|position|area|place|point|destination))?\b"
@@ -73,9 +78,12 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
     """Find the query of a task that is nearest to a text.
 
     A query matches itself. Any other text is split at "and", "or" and the other words that :func:`parse_query` reads,
-    and at "but", and each part matches the nearest base query. A part without a subject inherits the subject of the
-    previous part. A part with "not", "doesn't" or "never" matches the negation of the base query nearest to the
-    remaining words, so that a match never inverts the meaning.
+    and at "but". Each part matches the nearest base query, that is, the nearest of :func:`supported_queries` that is
+    not negated. A part without a subject inherits the subject of the previous part.
+
+    A part with a negation such as "doesn't", "never", "far from" or "without" matches the negation of the base query
+    nearest to the remaining words. A part with another negation, such as "fails to", matches with score 0. No part
+    matches a query that states the opposite ("above" and "below"), so a match never inverts the meaning.
 
     Args:
         text: any text with at most 256 parts.
@@ -95,13 +103,15 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
     if (query := read_query(text, owner)) is not None:
         parts = [QueryPart(str(clause), Query((clause,)), 1.0) for clause in query.clauses]
         return QueryMatch(query, 1.0, tuple(parts or [QueryPart(text, query, 1.0)]))
-    pieces = [" ".join(piece.split()) for piece in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]
-    pieces = [piece for piece in pieces if _content(_affirmed(piece)[0])]
+    text = _with_target(plain_negations(text), owner)
+    plain = re.split(r"\b(?:and|but)\b|[:;](?=.*\bnot\b)", text, flags=re.IGNORECASE)
+    pieces = [" ".join(piece.split()) for piece in plain]
+    pieces = [piece for piece in pieces if _content(affirmed(piece).words)]
     if not pieces:
         part = _nearest_part(" ".join(text.split()), owner, by)
         return QueryMatch(part.query, part.score, (part,))
     words = split_words(" and ".join(pieces))
-    # Spaces hide other words such as "or" from the parser.
+    # A leading space hides connectives other than "and" from the parser, since a piece may begin with "or".
     conjunction = _nearest_match([word for piece in pieces for word in ("and", f" {piece}")][1:], owner, by)
     assert conjunction is not None  # each piece is an operand
     if not _JOINS.intersection(map(str.casefold, words)):
@@ -110,12 +120,12 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
         match = _nearest_match(words, owner, by)
     except QueryError:  # a stray parenthesis
         match = _nearest_match([word for word in words if word not in "()"], owner, by)
-    # "at or near the puck" does not consist of two conditions.
+    # Splitting at "or" is wrong for a text like "at or near the puck", and then gives a lower score.
     return conjunction if match is None or match.least_score < conjunction.least_score else match
 
 
 def _nearest_match(words: list[str], task: Task, by: str) -> QueryMatch | None:
-    """Match each operand among words that :func:`parse_words` accepts; return None without any operand."""
+    """Match each operand to its nearest query, and combine the matches; return None if no operand has words."""
     known: dict[tuple[str, str], QueryPart] = {}  # a cache, since parts often repeat
     parts: list[QueryPart] = []
     subject = ""
@@ -123,7 +133,7 @@ def _nearest_match(words: list[str], task: Task, by: str) -> QueryMatch | None:
     def nearest(operand: list[str]) -> Expression | None:
         nonlocal subject
         part = " ".join(operand).strip()
-        if not _content(_affirmed(part)[0]):
+        if not _content(affirmed(part).words):
             return None
         if (part, subject) not in known:
             match = _nearest_part(part, task, by)
@@ -140,7 +150,7 @@ def _nearest_match(words: list[str], task: Task, by: str) -> QueryMatch | None:
         return None
     query = Query(expression)
     if all(part.query.is_conjunction for part in parts) and not _JOINS.intersection(map(str.casefold, words)):
-        query = Query(tuple(clause for part in parts for clause in part.query.clauses))  # spelled as it was given
+        query = Query(tuple(clause for part in parts for clause in part.query.clauses))  # keep the given spelling
     return QueryMatch(query, sum(part.score for part in parts) / len(parts), tuple(parts))
 
 
@@ -148,24 +158,43 @@ def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
     """Match one part of a text to the nearest base query or negated base query."""
     if (query := read_query(part, task)) is not None:
         return QueryPart(part, query, 1.0)
-    words, negated = _affirmed(part)
+    words, negated, is_read = affirmed(part)
     clauses, contents = _choices(task, tuple(PREDICATES))
+    written = poles(words)
+    if not any(name in _HANDS for name in task.object_names):
+        words = _A_HAND.sub("gripper", " ".join(words)).split()
+    subject = re.match(r"(?:is )?<([^>]*)> \w", mark_objects(" ".join(words[:_MOST_CLAUSES]), task))
+    name = subject[1] if subject and subject[1] in task.object_names else None
+    others = {other for other in task.object_names if name is not None and not same_object(task, name, other)}
+    unstated = _unstated(words, by)
+    opposed = [
+        (bool(written) and not agree(written, poles(clause.predicate.split())))
+        or (clause.subject in others)
+        or clause.predicate in unstated
+        for clause in clauses
+    ]
     if by == "edit":
-        _, similarity, at = process.extractOne(_content(words), contents, scorer=fuzz.ratio)
+        choices = [None if out else content for out, content in zip(opposed, contents, strict=True)]
+        _, similarity, at = process.extractOne(_content(words), choices, scorer=fuzz.ratio)
         score = similarity / 100
     else:
         text = " ".join(words).encode("utf-8", "replace").decode()  # an encoder cannot read a lone surrogate
         similarities = _vectors(tuple(map(str, clauses))) @ sentence_vectors([text])[0]
+        similarities[opposed] = -1.0
         at, score = int(similarities.argmax()), float(similarities.max().clip(0.0, 1.0))
-    return QueryPart(part, Query((replace(clauses[at], negated=negated),)), score)
+    return QueryPart(part, Query((replace(clauses[at], negated=negated),)), score if is_read else 0.0)
 
 
-def _affirmed(text: str) -> tuple[list[str], bool]:
-    """Return the words of a text without negations, and whether the number of negations is odd."""
-    plain = re.sub(r"(\w)n't\b", r"\1 not", text.replace("’", "'").casefold())
-    words = re.sub(r"[^\w\s'-]", " ", plain).split()
-    kept = [word for word in words if word not in _NEGATIONS]
-    return kept, (len(words) - len(kept)) % 2 == 1
+def _unstated(written: list[str], by: str) -> set[str]:
+    """Return the states for which a text has no word: "it is 5 o'clock" has none for "closed"."""
+    known = {state: [state.split()[-1]] for state in (STATES if by == "edit" else ())} | {TOUCHING: WORDS["contact"]}
+    words = [word for word in dict.fromkeys(written[:_LONGEST]) if word not in _EMPTY]
+
+    def is_stated(state: str) -> bool:
+        least = _LEAST_RATIOS[state == TOUCHING]
+        return any(process.extractOne(text, words, scorer=fuzz.ratio, score_cutoff=least) for text in known[state])
+
+    return {state for state in known if not is_stated(state)}
 
 
 def _content(words: list[str]) -> str:
@@ -212,8 +241,22 @@ def nearest_skill(
     if not allowed:
         raise SkillError(f"every scripted skill needs an object that task {task!r} lacks; pass other skills=")
     words = " ".join(text.lower().replace("_", " ").split())
-    name, similarity, _ = process.extractOne(words, allowed, scorer=fuzz.ratio)
-    return table[name], similarity / 100
+    kept = [name for name in allowed if not _is_opposite(words, name)]
+    name, similarity, _ = process.extractOne(words, kept or allowed, scorer=fuzz.ratio)
+    is_action = instruction(words).text and not rests(words)
+    return table[name], similarity / 100 if kept and is_action else 0.0
+
+
+def _is_opposite(text: str, skill: str) -> bool:
+    """Return whether a scripted skill does the opposite of a text, such as moving to what the text moves away from."""
+    words = text.split()
+    if not agree(poles(words), poles(skill.split())):
+        return True
+    source = source_of(text)
+    if source is None or source_of(skill) is not None:
+        return False
+    moves_hand = re.match(r"\w+ (?:the )?(?:robot's )?gripper\b", text) is not None
+    return moves_hand or bool({*source.split()} & {*skill.split()})
 
 
 class MappedQuery(NamedTuple):
@@ -239,7 +282,7 @@ class StepMapper:
         self.mapped: dict[str, MappedQuery] = {}
 
     def query(self, text: str) -> MappedQuery:
-        """Map a text to the nearest query within the limit."""
+        """Map a text to the nearest query, using a cache."""
         if text not in self.mapped:
             self.mapped[text] = self._query(text)
         return self.mapped[text]
@@ -254,22 +297,27 @@ class StepMapper:
         return MappedQuery(query if distance <= LIMIT else None, distance)
 
     def skill(self, text: str) -> tuple[str | None, float]:
-        """Return the nearest scripted skill's text (None if beyond the limit) and distance."""
+        """Return the text of the nearest scripted skill (None if it is too far), and its distance."""
         if text in self.skills:
             return text, 0.0
         if not self.skills or len(text) > _LONGEST:
             return None, 1.0
         words = _with_target(text, self.task)
-        if match := _phrases("skills").match(words):
-            words = WORDS["skills"][match[0]] + words[match.end() :]
-        skill, score = nearest_skill(words, None, self.skills)
+        text, aside, _ = instruction(words)
+        # "beside" of "beside rather than above the puck" has no object.
+        is_cut = aside and re.search(rf"\b{_PLACES}(?: \w+){{0,2}}$", text) and not poles(text.split())
+        if not text or is_cut or rests(text) or not has_certain_target(text, self.task):
+            return None, 1.0
+        if match := _phrases("skills").match(text):
+            text = WORDS["skills"][match[0]] + text[match.end() :]
+        skill, score = nearest_skill(text, None, self.skills)
         return (skill.text if 1.0 - score <= SKILL_LIMIT else None), 1.0 - score
 
 
 @lru_cache(maxsize=4096)
 def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
     """Return the query nearest to a condition (None if the condition has too many clauses) and the distance."""
-    words = _with_object(_with_target(text, task), task)
+    words = _with_object(_with_target(plain_negations(text), task), task)
     words = _phrases("conditions").sub(lambda match: WORDS["conditions"][match[0]], words)
     with suppress(QueryError):
         match = nearest_query(words, task)

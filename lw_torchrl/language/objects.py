@@ -28,12 +28,12 @@ _INDEX = re.compile(r"obs\[([0-9]{1,4})\]")
 
 
 def typed_position(position: Sequence[Coordinate]) -> TypedPosition:
-    """Tag each coordinate as index or metres, since the index 1 and 1.0 metres are equal in Python."""
+    """Tag each coordinate with its kind (index or metres), because 1 == 1.0 in Python."""
     return tuple((isinstance(coordinate, int), coordinate) for coordinate in position)
 
 
 def coordinate_indices(position: Sequence[Coordinate], constants: list[float], size: int) -> list[int]:
-    """Index each coordinate in an observation (of ``size``) followed by ``constants``, and append new constants."""
+    """Return the coordinates' indices in an observation (``size``) plus ``constants``; append missing constants."""
     fixed = dict.fromkeys(c for c in position if not isinstance(c, int))
     constants += [c for c in fixed if c not in constants]
     return [c if isinstance(c, int) else size + constants.index(c) for c in position]
@@ -47,7 +47,7 @@ class NamedObject:
     name: str  # "drawer handle": lower-case words without an article
     position: tuple[Coordinate, Coordinate, Coordinate]  # x, y and z
     offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # metres from the object's position to this point
-    ours: bool = False  # whether this is our added point, which the published object list lacks
+    ours: bool = False  # whether this package adds the point, which the paper's object list lacks
     opening: Natural | None = None  # index of the opening, from 0 (closed) to 1 (open); None if the object cannot open
 
     def __post_init__(self) -> None:
@@ -56,7 +56,7 @@ class NamedObject:
         if reserved := [word for word in self.name.split() if word in (*CONNECTIVES, "is", "not", "the")]:
             raise ValueError(f"name must not contain {reserved[0]!r}, which is reserved in queries, got {self.name!r}")
         if self.opening is not None and (self.ours or self.name == GRIPPER):
-            raise ValueError(f"opening of {self.name!r} must be None: points have none, the gripper's is in the layout")
+            raise ValueError(f"opening of {self.name!r} must be None: points have none, the layout has the gripper's")
 
 
 def _read_coordinate(value: Any) -> Coordinate:
@@ -64,7 +64,7 @@ def _read_coordinate(value: Any) -> Coordinate:
         return int(match[1])
     if isinstance(value, (int, float)) and type(value) is not bool and abs(value) < 1e9:  # larger integers overflow
         return float(value)
-    raise ValueError(f"coordinate must be like 0.1 or 'obs[37]', got {shown(value)}")
+    raise ValueError(f"coordinate must have a form like 0.1 or 'obs[37]', got {shown(value)}")
 
 
 def _read_position(value: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
@@ -76,7 +76,7 @@ def _read_position(value: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
     if isinstance(value, list) and len(value) == 3:
         x, y, z = map(_read_coordinate, value)
         return (x, y, z)
-    raise ValueError(f"position must be like 'obs[4:7]' or [0.1, 'obs[37]', 0.0], got {shown(value)}")
+    raise ValueError(f"position must have a form like 'obs[4:7]' or [0.1, 'obs[37]', 0.0], got {shown(value)}")
 
 
 def _read_object(name: str, row: Any) -> NamedObject:
@@ -126,7 +126,7 @@ def read_objects(row: Mapping[str, Any], layout: Layout = METAWORLD) -> tuple[Na
 
 
 def write_objects(objects: Sequence[NamedObject]) -> dict[str, dict[str, Any]]:
-    """Convert objects and points to a row of tasks.toml, as far as such a row can express them."""
+    """Convert objects and points to a row of tasks.toml, which may lose what such a row cannot express."""
     row: dict[str, dict[str, Any]] = {"objects": {}, "points": {}}
     published = {typed_position(named.position): named.name for named in reversed(objects) if not named.ours}
     for named in objects[1:]:

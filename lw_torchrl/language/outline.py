@@ -1,4 +1,4 @@
-"""Outlines: the guards of a plan's steps as a tree of ``if``, ``else if`` and ``else``, for people who read plans."""
+"""Outlines: a plan's conditions as a tree of ``if``, ``else if`` and ``else``, for human readers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lw_torchrl.language.expressions import Expression, all_of, as_expression, l
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import TOUCHING
 
-MOST_DEPTH = 12  # maximum nesting; deeper branches have one step each
+MOST_DEPTH = 12  # maximum depth at which several steps share a branch
 _Parts: TypeAlias = dict[Expression, None]  # the parts of a conjunction, in order
 
 
@@ -20,12 +20,12 @@ class Line:
     """A line of an outline: the head of a branch, or a step."""
 
     depth: int  # nesting, from 0
-    steps: tuple[int, ...]  # indices of the steps in the branch, from 0; of the step itself
+    steps: tuple[int, ...]  # indices (from 0) of the steps in the branch, or of the step itself
     head: str = ""  # "if", "else if" or "else"; "" for a step
     condition: Expression | None = None  # of "if" and "else if"
 
     def __str__(self) -> str:
-        """Return the head of a branch with its condition in short form; the number of a step, from 1."""
+        """Return a branch's head with its condition in short form, or a step's number (from 1)."""
         if not self.head:
             return str(self.steps[0] + 1)
         if self.condition is None:
@@ -35,10 +35,10 @@ class Line:
 
 
 def outline(guards: Sequence[Any]) -> list[Line]:
-    """Arrange the steps of a plan by the conditions that neighbouring steps share.
+    """Arrange the steps of a plan by the conditions that consecutive steps share.
 
-    A step's guard is the conjunction of the conditions above it, where "else" excludes the branches above it at the
-    same depth.
+    A step's condition is the conjunction of the branch heads above the step. "else" negates the preceding branches at
+    the same depth.
 
     Args:
         guards: the steps' conditions, as queries, expressions or texts.
@@ -68,7 +68,7 @@ def _parts(expression: Expression) -> tuple[Expression, ...]:
 
 
 def _implies(parts: _Parts, other: Expression, levels: int = 2) -> bool:
-    """Return whether a conjunction implies another expression, as far as the form of its first levels shows."""
+    """Return whether a conjunction implies another expression, comparing only the first ``levels`` levels."""
     if other in parts or not levels or other.kind == "leaf":
         return other in parts
     return (all if other.kind == "all" else any)(_implies(parts, part, levels - 1) for part in other.parts)
@@ -76,7 +76,7 @@ def _implies(parts: _Parts, other: Expression, levels: int = 2) -> bool:
 
 def _arrange(steps: Sequence[tuple[int, _Parts]], depth: int, lines: list[Line]) -> None:
     """Append the outline of steps, each an index and the parts of its guard that are not yet written."""
-    excluded = list[Expression]()  # the negations of the branches above, while "else" can follow
+    excluded = list[Expression]()  # the negations of the preceding branches, as long as "else" can follow
     at = 0
     while at < len(steps):
         number, parts = steps[at]
@@ -98,9 +98,9 @@ def _arrange(steps: Sequence[tuple[int, _Parts]], depth: int, lines: list[Line])
 
 
 def _run(steps: Sequence[tuple[int, _Parts]], excluded: Sequence[Expression]) -> list[tuple[int, _Parts]]:
-    """Return the steps of the next branch, without the parts of their guards that "else" states.
+    """Return the steps of the next branch, without the parts of their guards that "else" already implies.
 
-    The branch holds the most steps in a row that share a part of the first step's guard.
+    The branch contains the longest run of steps that share a part of the first step's guard.
     """
     stated = {part for negation in excluded for part in _parts(negation)}
     run = list[tuple[int, _Parts]]()

@@ -13,7 +13,7 @@ from typing import Literal
 
 from lw_torchrl._util.checks import did_you_mean, shown, typed
 from lw_torchrl._util.files import AnyPath, parse_json, read_text, write_text
-from lw_torchrl.language.nearest import nearest_query
+from lw_torchrl.language.nearest import LIMIT, nearest_query
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, PlanError, Plans, PlanStep, as_plans
 from lw_torchrl.language.queries import Query, QueryError, check_query
 from lw_torchrl.language.tasks import MT10, TASKS, Tasks
@@ -131,12 +131,12 @@ def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks
     """Load the shipped plans, or plans from files.
 
     A .json file maps task names to lists of (condition, skill) pairs, at the top level or under the key "plans". A
-    condition outside the query language is replaced by the nearest query (:func:`nearest_query`); the step's ``reason``
-    then quotes the original condition.
+    condition outside the query language is replaced by the nearest query (:func:`nearest_query`) if each clause is
+    within a distance of 0.4; the step's ``reason`` then quotes the original condition.
 
     Args:
         source: "MT10" or "MT50" for the shipped plans; or the path of a .plan or .json file, or of a folder of .plan
-            files. A .plan file may have any name except the name of a task other than its own.
+            files. A .plan file must not have the name of another task.
         skills: the wording of the shipped plans. With "own" every step has a scripted skill; with "MT10" every step is
             worded as in the MT10 plans, for policies that were trained on those plans only.
         tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
@@ -165,7 +165,7 @@ def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks
     paths = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
     if not paths:
         hint = "use lw.decode_plan for a language model's answer, and lw.save_plans to write .plan files"
-        raise FileNotFoundError(f"the folder {str(path)!r} holds no .plan files; {hint}")
+        raise FileNotFoundError(f"the folder {str(path)!r} contains no .plan files; {hint}")
     return _read_all(list[Traversable](paths), tasks)
 
 
@@ -177,35 +177,71 @@ def _read_all(paths: list[Traversable], tasks: Tasks) -> Plans:
         text = read_text(path, PlanError, limit=PLAN_LIMIT)
         plan = parse_plan(text, stem if stem in tasks else None, path.name, tasks)
         if plan.task in plans:
-            raise PlanError(f"{path.name}: a second plan for {plan.task!r}; {names[plan.task]} also holds one")
+            raise PlanError(f"{path.name}: {plan.task!r} already has a plan in {names[plan.task]}; remove one file")
         plans[plan.task], names[plan.task] = plan, path.name
     return Plans(plans)
 
 
 def _read_pairs(path: Path, tasks: Tasks) -> Plans:
+    plans, faults = check_pairs(read_text(path, PlanError, limit=PLAN_LIMIT), path.name, tasks)
+    if faults:
+        raise PlanError("; ".join(faults[:5]) + (f"; and {len(faults) - 5} more" if faults[5:] else ""))
+    return Plans(plans)
+
+
+def is_pairs(text: str) -> bool:
+    """Return whether a text is JSON that maps names to lists of pairs, rather than a program in JSON."""
     try:
-        content = parse_json(read_text(path, PlanError, limit=PLAN_LIMIT).encode())
+        content = parse_json(text.encode())
+    except ValueError:
+        return False
+    rows = content.get("plans", content)
+    return (
+        isinstance(rows, dict)
+        and bool(rows)
+        and all(isinstance(pairs, list) and all(isinstance(pair, list) for pair in pairs) for pairs in rows.values())
+    )
+
+
+def check_pairs(text: str, source: str, tasks: Tasks = TASKS) -> tuple[list[ConditionalPlan], list[str]]:
+    """Parse JSON of (condition, skill) pairs, and return the plans and all errors.
+
+    A condition with a clause that is further than :data:`~lw_torchrl.language.nearest.LIMIT` from every query is an
+    error.
+    """
+    try:
+        content = parse_json(text.encode())
     except ValueError as error:
-        raise PlanError(f"{path.name}: expected JSON that maps task names to lists of pairs: {error}") from error
+        return [], [f"{source}: expected JSON that maps task names to lists of pairs: {error}"]
     rows = content.get("plans", content)
     if not isinstance(rows, dict):
-        raise PlanError(f"{path.name}: expected task names mapped to (condition, skill) pairs, got {shown(rows)}")
-    plans = []
+        return [], [f"{source}: expected task names mapped to (condition, skill) pairs, got {shown(rows)}"]
+    plans, faults = list[ConditionalPlan](), list[str]()
     for name, pairs in rows.items():
         if name not in tasks:
-            raise PlanError(f"{path.name}: {shown(name)} is not a task{did_you_mean(name, tasks)}")
-        steps = []
+            faults.append(f"{source}: {shown(name)} is not a task{did_you_mean(name, tasks)}")
+            continue
+        steps, before = list[PlanStep](), len(faults)
         for number, pair in enumerate(pairs if isinstance(pairs, list) else [pairs], 1):
-            where = f"{path.name}, {name}, step {number}"
+            where = f"{source}, {name}, step {number}"
             if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(text, str) for text in pair)):
-                raise PlanError(f"{where}: expected a pair of strings (condition, skill), got {shown(pair)}")
+                faults.append(f"{where}: expected a pair of strings (condition, skill), got {shown(pair)}")
+                continue
             try:
                 match = nearest_query(pair[0], tasks[name])
             except QueryError as error:
-                raise PlanError(f"{where}: {error}") from error
+                faults.append(f"{where}: {error}")
+                continue
+            if match.least_score < 1.0 - LIMIT:
+                distance = f"the distance of the nearest, {str(match.query)!r}, is {1.0 - match.least_score:.2f}"
+                faults.append(f"{where}: no query is near enough to the condition {shown(pair[0])} ({distance})")
             steps.append(PlanStep(match.query, pair[1], "" if match.score == 1.0 else f"nearest to: {pair[0]}"))
-        plans.append(ConditionalPlan(name, tuple(steps), tasks[name]))
-    return Plans(plans)
+        if len(faults) == before:
+            try:
+                plans.append(ConditionalPlan(name, tuple(steps), tasks[name]))
+            except PlanError as error:
+                faults.append(f"{source}: {error}")
+    return plans, faults
 
 
 @typed

@@ -63,10 +63,10 @@ class PlanStep:
     role: StepRole | None = None  # the action and its objects, in plans of :func:`~lw_torchrl.canonical_plan`
 
     def mentions(self, task: Task) -> set[str]:
-        """Return the names of the objects that the condition or the skill mentions; the goal may appear as "target
-        location".
+        """Return the names of the objects that the condition or the skill mentions.
 
-        The skill's objects are taken from the step's role or, without a role, found by name in the skill's text.
+        The skill's objects come from the step's role, which calls the goal "target location". Without a role, they are
+        found by name in the skill's text.
         """
         clauses = self.condition.clauses
         names = {name for clause in clauses for name in (clause.subject, clause.object) if name is not None}
@@ -110,7 +110,7 @@ class ConditionalPlan:
                 condition, skill = check_query(step.condition, task), canonical_skill(step.skill, task)
                 goal = None if step.goal is None else check_query(step.goal, task)
                 if goal is not None and goal.has_latch:
-                    raise PlanError(f"a goal is a state, without 'has been' and 'once'; use {str(goal.present)!r}")
+                    raise PlanError(f"a goal must not contain 'has been' or 'once'; use {str(goal.present)!r}")
                 for name in () if step.role is None else step.role.objects:
                     role_object(task, name)
             except ValueError as error:
@@ -134,7 +134,7 @@ class ConditionalPlan:
     ) -> ConditionalPlan:
         """Build a plan from a program with control flow; the text is parsed, never executed.
 
-        Each action becomes a step whose condition is that of its path, as :func:`~lw_torchrl.decode_plan` describes.
+        Each action becomes a step, guarded by all conditions on the path to it, as in :func:`~lw_torchrl.decode_plan`.
         That function also reports what was left out.
 
         Args:
@@ -143,8 +143,8 @@ class ConditionalPlan:
                 :data:`lw_torchrl.language.library.LIBRARY`; None for none.
 
         Raises:
-            PlanError: the program has no action for the task that can be read, it nests too deeply, or a program of the
-                library calls itself.
+            PlanError: no action for the task can be parsed, the program nests too deeply, or a program of the library
+                calls itself.
 
         Example:
             >>> program = '''

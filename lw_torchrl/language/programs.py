@@ -46,7 +46,7 @@ class Branch:
 
 @dataclass(frozen=True)
 class Sequence:
-    """Programs in turn: each waits until the previous ones succeed, and fails if one of them fails.
+    """A sequence of programs. Each runs once all previous ones succeed; if one fails, the sequence fails.
 
     With ``memory``, a program that has succeeded while it was active is not run again in the episode.
     """
@@ -57,7 +57,7 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Block:
-    """A block of code: branches and loops run side by side; an action waits until all parts above it are done."""
+    """A block of code. Its branches and loops run concurrently; an action waits until all parts above it are done."""
 
     parts: tuple[Node, ...] = ()
 
@@ -96,9 +96,9 @@ class Label:
 
 @dataclass(frozen=True)
 class Done:
-    """A leaf of a condition: the effect of an action is reached."""
+    """A leaf of a condition, which is true if an action has had its effect."""
 
-    text: str  # of the action
+    text: str  # the action's text
 
 
 Node: TypeAlias = Action | Check | Branch | Sequence | Block | Selector | Loop | Jump | Label
@@ -106,10 +106,10 @@ Node: TypeAlias = Action | Check | Branch | Sequence | Block | Selector | Loop |
 
 @dataclass
 class _Flow:
-    """What follows a program, as conditions relative to the program's own guard."""
+    """The conditions under which control leaves a program, given that the program's guard is true."""
 
-    falls: Expression = TRUE  # control leaves at the end, if actions take no time
-    settles: Expression = TRUE  # all actions are done as well
+    falls: Expression = TRUE  # control reaches the end, if actions took no time
+    settles: Expression = TRUE  # control reaches the end, and all actions are done
     fails: Expression = FALSE
     jumps: dict[str, Expression] = field(default_factory=dict)  # label to the condition of a jump to it
 
@@ -130,16 +130,17 @@ def compile_program(
 ) -> list[Guarded]:
     """Compile a program into guarded actions, for a policy that evaluates all guards at each control step.
 
-    An action's guard is the condition of its path. Actions in turn wait for the previous action's effect; both are
-    active if that effect has no name.
+    An action's guard is the conjunction of the conditions on the path to it. In a sequence, an action also waits for
+    the effect of the previous action; if no condition expresses that effect, both actions are active.
 
     Args:
-        effect: returns the condition that an action makes true ("the gripper is open"), or None if it has no name.
-        known: returns whether a condition can be evaluated; a loop with an unknown condition runs always.
-        is_done: returns whether a guard implies an effect, which then cannot be the effect of the guarded action.
+        effect: returns the condition that an action makes true ("the gripper is open"), or None if there is none.
+        known: returns whether a condition can be evaluated; a loop with an unknown condition always runs.
+        is_done: returns whether a guard implies an effect. An action whose guard implies its effect counts as an action
+            without an effect.
 
     Raises:
-        ProgramError: the program nests more than 60 programs, or a condition joins more than 1,000 others.
+        ProgramError: the program nests more than 60 levels deep, or a condition joins more than 1,000 parts.
 
     Example:
         >>> near, far = Action("close the gripper"), Action("move to the puck")
@@ -221,10 +222,10 @@ class _Compiler:
     def run(self, node: Node, here: Expression, followed: bool, depth: int) -> _Flow:
         """Append the guarded actions of a program with the guard ``here``.
 
-        An action that is ``followed`` by another one stops at its effect.
+        If a program is ``followed`` by another one, its last action stops as soon as it has had its effect.
         """
         if depth > MOST_DEPTH:
-            raise ProgramError(f"a program must nest at most {MOST_DEPTH} parts; split it into steps side by side")
+            raise ProgramError(f"a program must nest at most {MOST_DEPTH} levels deep; split it into consecutive steps")
         if isinstance(node, Action):
             return self.action(node, here, followed)
         if isinstance(node, Check):
@@ -299,7 +300,8 @@ class _Compiler:
         last_wait = max((k for k, part in enumerate(parts) if not isinstance(part, Jump | Label)), default=-1)
         last_action = max((k for k, part in enumerate(parts) if isinstance(part, Action)), default=-1)
         last_end = max((k for k, part in enumerate(parts) if isinstance(part, Jump) and not part.label), default=-1)
-        # hard: what every later part waits for; soft: what later actions wait for; done: without failed conditions.
+        # hard: the condition for all later parts; soft: the additional condition for later actions; done: the condition
+        # under which the previous parts have succeeded, apart from checks.
         hard, soft, done, falls, fails, jumps = TRUE, TRUE, TRUE, TRUE, list[Expression](), dict[str, Expression]()
         for number, part in enumerate(parts):
             if isinstance(part, Label):
@@ -332,14 +334,14 @@ class _Compiler:
             before, done = done, once(all_of([here, done, flow.settles]))
             fails.append(all_of([before, negate(done), flow.fails]))
             falls = all_of([falls, flow.falls])
-            if flow.settles != TRUE:  # an action whose effect has no name stays active
+            if flow.settles != TRUE:  # otherwise no effect of the last action is known, so the action stays active
                 for number, step in enumerate(self.steps[begin:], begin):
                     self.steps[number] = replace(step, guard=all_of([step.guard, negate(done)]))
         return _Flow(falls, done, any_of(fails))
 
 
 def _inlined(node: Sequence | Block) -> list[Node]:
-    """Return the parts of a sequence, with those of sequences in it."""
+    """Return the parts of a sequence, with nested sequences flattened."""
     parts = list[Node]()
     for part in node.parts:
         is_same = type(part) is type(node) and not (isinstance(part, Sequence) and part.memory)

@@ -43,7 +43,7 @@ _BEGINNINGS = {"is", "are", "isn't", "aren't", "not"} | {
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
 _OTHERS = frozenset(("(", *CONNECTIVES)) - {"and"}
-MOST_CLAUSES = 256  # in the text of a query
+MOST_CLAUSES = 256  # maximum number of clauses in the text of a query
 _PERFECT = re.compile(
     r"\b(?:(?:has|have|had)|(?:was|were)(?= (?:not |never )?(?:once|ever)\b))(n't\b| not\b| never\b)?"
     r"(?: (?:once|ever|already|yet|just|before)\b)*(?: been\b)?"
@@ -68,8 +68,8 @@ class Clause:
 class Query:
     """A condition: a boolean expression over clauses. ``str(query)`` is the canonical spelling.
 
-    Queries are equal if their expressions have the same normal form. A conjunction is spelled as it was given, with
-    repeated clauses.
+    Queries are equal if their expressions have the same normal form. The text of a conjunction keeps the clauses as
+    given, including repetitions.
 
     Args:
         expression: an expression over clauses (:mod:`lw_torchrl.language.expressions`); or a tuple of clauses that must
@@ -126,7 +126,7 @@ class Query:
 
     @cached_property
     def implied(self) -> tuple[Clause, ...]:
-        """The clauses that are true wherever the query is true, as far as its form shows."""
+        """Clauses that are true wherever the query is true; see :func:`~lw_torchrl.language.expressions.implied`."""
         found = [literal for literal in implied(self.expression) if not isinstance(literal.leaf, Once)]
         return self._given or tuple(map(_as_clause, found))
 
@@ -159,7 +159,7 @@ def _write_literal(leaf: Clause | Once, negated: bool) -> str:
 
 
 def split_perfect(text: str) -> tuple[str, bool, bool]:
-    """Return a clause in the present tense, whether it was in the perfect tense, and whether that was negated.
+    """Return a clause in the present tense, whether it was in the perfect tense, and whether the perfect was negated.
 
     Example:
         >>> split_perfect("the gripper has not been near the puck")
@@ -202,7 +202,7 @@ def split_words(text: str) -> list[str]:
 
 @lru_cache(maxsize=16)
 def _two_relations(names: tuple[str, ...]) -> re.Pattern[str]:
-    """Compile a pattern that matches two relations to one object."""
+    """Compile a regex for phrases with two relations and a shared object, such as "above and near the puck"."""
     relation = "|".join(map(re.escape, sorted(names, key=len, reverse=True)))
     word = r"(?!(?:and|or|nor|unless|is|isn't)\b)[^\s()]+"
     return re.compile(rf"\b({relation}) (and|or) ({relation}) ({word}(?: {word})*)", re.IGNORECASE)
@@ -227,10 +227,10 @@ def base_clauses(task: Task, predicates: tuple[str, ...]) -> tuple[Clause, ...]:
 
 @typed
 def supported_queries(task: str | Task, published_only: bool = False) -> tuple[str, ...]:
-    """Return the base queries of a task, in canonical spelling.
+    """Return the supported queries of a task that consist of a single clause, in canonical spelling.
 
-    :func:`parse_query` also accepts any relation between two distinct objects, "touching the table" for any object,
-    negated states, and conjunctions of clauses.
+    These base queries are a selection: :func:`parse_query` also accepts "around" for any two objects, "touching the
+    table" for any object, negated states, and any combination of clauses.
 
     Args:
         published_only: return only the paper's queries, without our added points and without custom relations.
@@ -337,8 +337,8 @@ def parse_query(text: str, task: str | Task) -> Query:
     subject if the previous clause has the same subject ("... is open and not above the puck").
 
     Clauses are joined by "and", "or", "unless", "either ... or", "both ... and", "neither ... nor", "not (...)" and
-    parentheses to any depth. "and" binds tighter than "or", and "unless" binds loosest. "always" is a condition that is
-    always true, "never" one that is never true.
+    parentheses to any depth. "and" binds tighter than "or", and "unless" binds loosest. The condition "always" is
+    always true, and "never" is never true.
 
     A latch is true from the first step of an episode in which a condition was true: "the gripper has been near the
     puck", "once (the gripper is near the puck and closed)". Its condition may contain latches.
@@ -367,7 +367,7 @@ def read_query(text: str, task: Task) -> Query | None:
 
 
 def _parse(text: str, task: Task, explain: bool) -> Query:
-    words = repeat_predicate(split_words(text.replace("’", "'").casefold().strip().strip(" ?.!")), _BEGINNINGS)
+    words = repeat_predicate(split_words(text.replace("’", "'").casefold().strip().rstrip(" ?.!")), _BEGINNINGS)
     clauses: list[Clause] = []
 
     def operand_of(operand: list[str]) -> Expression:
@@ -400,7 +400,7 @@ def check_query(query: str | Query, task: str | Task) -> Query:
     owner = get_task(task)
     clauses = len(query.clauses) if query.is_conjunction else count_mentions(query.expression)
     if clauses > MOST_CLAUSES:
-        raise QueryError(f"a query must have at most {MOST_CLAUSES} clauses when it is written, got {clauses}")
+        raise QueryError(f"a query's text must have at most {MOST_CLAUSES} clauses, got {clauses}")
     if all(_is_of(clause, owner) for clause in query.clauses):
         return query
     return parse_query(str(query), owner)  # resolves aliases, or raises an error that explains the fault

@@ -169,12 +169,16 @@ class QueryProgram(nn.Module):
         """Return soft truth values: each query's margin as a logit, differentiable in the observation.
 
         A comparison's margin is its distance to the threshold, divided by its temperature (see
-        :class:`~lw_torchrl.language.relations.Comparison`). A clause has the smallest margin of its comparisons, a
-        negation the negative margin. With "min-max", a conjunction has the smallest margin of its operands, a
-        disjunction the largest: the logit is positive if the query is true, otherwise negative, and never zero, and its
-        gradient is the gradient of the comparison that decides. With "product", the operands are independent
-        statements, whose probabilities are the sigmoids of their logits: every operand has a gradient, and a true query
-        may have a negative logit near a threshold. Gradients are finite.
+        :class:`~lw_torchrl.language.relations.Comparison`). A clause has the smallest margin of its comparisons, and a
+        negation changes the sign.
+
+        With "min-max", a conjunction has the smallest margin of its operands, and a disjunction the largest. The logit
+        is positive if the query is true, otherwise negative, and never zero. Its gradient is that of the comparison
+        that decides.
+
+        With "product", the operands are treated as independent statements, whose probabilities are the sigmoids of
+        their logits. Every operand then has a gradient, but a true query may have a negative logit near a threshold.
+        Gradients are always finite.
 
         Args:
             observation, task_id, latches: as for :meth:`forward`. A latch that is already true has the logit 1e4.
@@ -202,7 +206,7 @@ class QueryProgram(nn.Module):
         if truth == "product":
             return soft.clamp(-_MOST, _MOST)
         size = torch.where(exact, soft, -soft).detach().clamp(_LEAST, _MOST)
-        # The value has the sign of the hard truth, even exactly on a threshold; the gradient is the gradient of soft.
+        # The value has the sign of the hard truth, even exactly on a threshold; the gradient is that of ``soft``.
         return soft - soft.detach() + torch.where(exact, size, -size)
 
     def _kernel(
@@ -218,7 +222,7 @@ class QueryProgram(nn.Module):
     def _answer(
         self, kernel: Callable[..., bool], observation: Tensor, task_id: Tensor, latches: Tensor | None = None
     ) -> Tensor:
-        """Answer with the kernel. PyTorch operations are slow here, since physics has just evicted the CPU's caches."""
+        """Answer with few PyTorch operations, which are slow here, as physics has just evicted the CPU's caches."""
         states = observation.numpy(force=observation.requires_grad).reshape(-1, self.layout.size)
         ids = task_id.numpy().reshape(-1)
         truth = np.empty((len(ids), self._columns), dtype=bool)
@@ -228,7 +232,7 @@ class QueryProgram(nn.Module):
         batch = np.ascontiguousarray(states), np.ascontiguousarray(ids, dtype=np.int64), before
         if not kernel(*batch, *self._facts[observation.dtype], truth):
             check_finite("observation", observation)
-            self._tables.select(task_id.reshape(-1), observation)  # either this call or the one above raises
+            self._tables.select(task_id.reshape(-1), observation)  # this call raises if the one above did not
         return torch.from_numpy(truth.reshape(*task_id.shape, self._columns))
 
     def _combine(self, atoms: Tensor, tables: QueryTables, truth: Truth) -> Tensor:
@@ -236,7 +240,7 @@ class QueryProgram(nn.Module):
         return evaluate_gates(atoms, Gates(tables.inputs, tables.negated, self._shapes), truth)
 
     def _values(self, observation: Tensor, tables: QueryTables, floor: float = 0.0) -> Tensor:
-        """Return each atom's value (B, A) in metres; ``floor`` is the minimum length, since 0 has no gradient."""
+        """Return each atom's value (B, A) in metres; ``floor`` bounds lengths from below, since 0 has no gradient."""
         numbers = torch.cat((observation.reshape(-1, self.layout.size), tables.constants), 1)
         d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1)) + tables.shift
         x, y, z = d.unbind(1)

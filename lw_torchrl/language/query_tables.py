@@ -1,4 +1,4 @@
-"""Tables for :class:`~lw_torchrl.QueryProgram`: queries compiled to tensors, and to bits for the Numba kernel."""
+"""Tables for :class:`~lw_torchrl.QueryProgram`: queries compiled to tensors, and to bitmasks for the Numba kernel."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
 
 @dataclass(frozen=True)
 class Before:
-    """A leaf: the truth of latch ``number`` before the current step."""
+    """A leaf: the value of latch ``number`` before the current time step."""
 
     number: int
 
@@ -93,7 +93,7 @@ class Before:
 def unroll(queries: Iterable[Query]) -> tuple[list[Expression], list[Expression]]:
     """Return queries without latches, and the expression of each latch, inner latches first.
 
-    Latch n is replaced by "Before(n), or its condition is true now".
+    Latch n becomes the disjunction of ``Before(n)`` and the latch's condition.
     """
     latches: dict[Once, Expression] = {}
 
@@ -111,7 +111,11 @@ def unroll(queries: Iterable[Query]) -> tuple[list[Expression], list[Expression]
 
 
 def _columns(queries: Mapping[Task, Sequence[Query]]) -> tuple[list[list[Expression]], int]:
-    """Return each task's S query and L latch expressions (possibly fewer than S if L is 0), and the number L."""
+    """Return the expressions of each task, and the largest number L of latches.
+
+    With latches, each list begins with S query expressions, padded with expressions that are never true, and ends with
+    the task's latch expressions. Tables of plans without latches are not padded.
+    """
     unrolled = [unroll(listed) for listed in queries.values()]
     latches = max(len(own) for _, own in unrolled)
     steps = max(map(len, queries.values())) if latches else 0
@@ -119,10 +123,11 @@ def _columns(queries: Mapping[Task, Sequence[Query]]) -> tuple[list[list[Express
 
 
 class QueryTables(NamedTuple):
-    """Tensors that encode queries: the A atoms of each task, and the gates that make S queries and L latches of them
-    and of the L latches before.
+    """Tensors that encode queries: the A atoms of each task, and gates.
 
-    The first dimension is the tasks (T), or the rows of the batch (B) in tables that were selected for a batch.
+    The gates compute S queries and L latches from the atoms and the latches' L previous values.
+
+    The first dimension indexes the tasks (T) or, in tables selected for a batch, the rows of the batch (B).
     """
 
     first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; an unused axis has the index of 0.0
@@ -189,9 +194,9 @@ Bits = NDArray[np.uint64]
 class QueryFacts(NamedTuple):
     """The facts (F) of all tasks as bits, one task after another.
 
-    A task's facts are its latches before (L, the first bits), length comparisons, single-coordinate comparisons and
-    gates (D). A gate or a query
-    is true if ``facts & care == want``, where ``care`` masks the bits that it depends on.
+    A task's facts are the previous values of its L latches (the first bits), then length comparisons, then comparisons
+    of single coordinates, then gates (D). A gate or query is true if ``facts & care == want``, where ``care`` masks the
+    bits that matter.
     """
 
     ids: NDArray[np.int64]  # (T,), task ids, ascending
@@ -255,7 +260,7 @@ def _task_facts(
 
 
 def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
-    """Compile queries of tasks in the order of their ids to facts; return None if a task has more than 63 facts."""
+    """Compile the queries of tasks, sorted by task id, to facts; return None if a task has more than 63 facts."""
     ids = [task_id(task.name) for task in queries]
     row_of = np.full(len(MT50), -1)
     for row, number in enumerate(ids):

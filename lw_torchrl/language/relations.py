@@ -1,4 +1,7 @@
-"""Relations and states: comparisons of d = first position - second position (m), from data/relations.toml."""
+"""Load spatial relations and object states from data/relations.toml.
+
+Each is a set of comparisons on d = first position - second position, in metres.
+"""
 
 import re
 from collections import ChainMap
@@ -17,9 +20,7 @@ from lw_torchrl.language.layout import Layout
 @typed_fields
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison with a threshold of d = first position - second position: either its length or one of its
-    coordinates.
-    """
+    """A threshold on the length, or on one coordinate, of the vector d = first position - second position."""
 
     axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]  # the axes of d to compare
     sense: Literal["<", ">", "<="]

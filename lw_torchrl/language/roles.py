@@ -1,4 +1,4 @@
-"""Step roles (the verb, objects and direction of a plan step), and the rewriting of free-form steps."""
+"""Parse the roles of a plan step (verb, objects and direction), and rewrite free-form steps."""
 
 from __future__ import annotations
 
@@ -6,15 +6,24 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from itertools import groupby, pairwise
 from typing import Any, Literal, get_args
+
+from rapidfuzz.distance import OSA
 
 from lw_torchrl._util.checks import Probability, shown, typed_fields
 from lw_torchrl.language.objects import GOAL, GRIPPER, WORDS
-from lw_torchrl.language.tasks import Task, whole_objects
+from lw_torchrl.language.polarity import MOTIONS, command_form, instruction
+from lw_torchrl.language.tasks import TASKS, Task, whole_objects
 
 _WORDS = WORDS["canonical"]
 _HANDS: dict[str, str] = dict.fromkeys([GRIPPER, *_WORDS["hands"]], GRIPPER)  # names of the gripper
 _NO_NAME = {"location", "target", "reach", "other", "side", "top", "edge"}  # words that do not identify an object
+_NOUN_PHRASE = {"the", "a", "an", "its", "your", "both", "it", "they", "nice", "and", *_WORDS["place"]}
+_BESIDE = re.compile(
+    rf"\b({'|'.join(_WORDS['places']['beside'])}|front|behind|below|under)(?: of| to)? <(?:target|reach) "
+)
+_LATER = re.compile(r"(?:[,;]|\bthen\b) (?:and |then )*((\w+)\b.*)")  # a second action: "then push it back"
 _GOAL = r"(?:the )?(?:reach |reacher )?(?:goal|target|destination)(?: (?:location|position|area|place|point|bin|spot))?"
 _LONGEST = 500  # characters; no real step is longer, and the rewriting time grows quadratically
 
@@ -30,6 +39,7 @@ _PATTERNS = {
     "PLACE": _any(_WORDS["place"]),
     "THING": r"(?:<[^>]*>|it|them|there|its \w+)(?![\w'-])",
     "HAND": f"<{GRIPPER}>",
+    "ATTACHED": f"<{_any(_WORDS['attached'])}>",
 }
 
 
@@ -67,6 +77,9 @@ def _names(task: Task) -> dict[str, str]:
         for word in re.findall(r"[a-z]+", name.replace("'s", "")):
             if word not in _NO_NAME:
                 words.setdefault(word, name)
+    attached = [name for name in whole_objects(task) if name in _WORDS["attached"]]
+    if len(attached) == 1:  # "the lever" is the handle
+        words = dict.fromkeys(_WORDS["attached"], attached[0]) | words
     longest = sorted(names, key=len, reverse=True)
     return (
         {re.escape(name): names[name] for name in longest}
@@ -75,9 +88,109 @@ def _names(task: Task) -> dict[str, str]:
     )
 
 
+@lru_cache(maxsize=1)
+def vocabulary() -> frozenset[str]:
+    """Return the words of the tables and of the 50 tasks, which are never corrected as misspelled."""
+    texts = [text for task in TASKS.values() for text in (task.description, *task.object_names)]
+    return frozenset(re.findall(r"[a-z]+", f"{WORDS} {' '.join(texts)}".lower()))
+
+
+def respell(text: str, task: Task) -> str:
+    """Correct misspelled words for actions, places and a task's objects: "cloze teh pukc" becomes "close the puck".
+
+    A word is treated as a misspelling if it begins with the right letter and differs by one or two letters, or by two
+    letters that are swapped. If the text spells a name correctly elsewhere, no word is corrected to that name.
+    """
+    words = re.findall(r"[a-z]+", text)
+    objects = {"target", "location", *re.findall(r"[a-z]{3,}", " ".join(task.object_names))}
+    names = {"the", *objects, *re.findall(r"[a-z]{4,}", " ".join((*_WORDS["hands"], *_WORDS["place"])))}
+    missing = [name for name in sorted(names) if name not in words or name == "the"]
+
+    def corrected(match: re.Match[str]) -> str:
+        word = match[0]
+        if word in vocabulary() or len(word) < 2:
+            return word
+        for name in missing:
+            most = 2 if len(name) >= 7 and name not in _WORDS["place"] else 1
+            if name[0] != word[0] or OSA.distance(word, name, score_cutoff=most) > most or f"{word}s" == name:
+                continue
+            # A wrong letter may turn a short word into a different word ("hard", "hand"); swapped letters do not.
+            if (
+                len(name) >= 6
+                or (name in objects and len(name) > 3)
+                or sorted(word) == sorted(name)
+                or (name != "the" and len(word) != len(name))
+            ):
+                return name
+        return word
+
+    verb = text.partition(" ")[0]
+    if verb not in vocabulary() and len(verb) > 3:
+        near = [each for each in MOTIONS if each[0] == verb[0] and OSA.distance(each, verb, score_cutoff=1) <= 1]
+        text = near[0] + text.removeprefix(verb) if len(near) == 1 else text
+    return re.sub(r"(?<![\w'-])[a-z]+(?![\w'-])", corrected, text)
+
+
+@lru_cache(maxsize=256)
+def _used_words(task: Task) -> frozenset[str]:
+    """Return the words that the parser of steps uses, in a task."""
+    names = [name for other in (task, *TASKS.values()) for name in other.object_names]
+    tables = str((_WORDS, WORDS["negation"]["affirms"], WORDS["negation"]["manner"]))
+    text = " ".join((re.sub(r"\\+[a-z]", " ", tables), task.description, *names))
+    return (frozenset(re.findall(r"[a-z]+", text.lower())) | MOTIONS) - {*_WORDS["unexpressed"]}
+
+
+@lru_cache(maxsize=4096)
+def ignored_words(skill: str, task: Task) -> str:
+    """Return the words of a skill that no step can express, and that a parser therefore ignores; "" if there are none.
+
+    Example:
+        >>> ignored_words("push the puck three times, but do not touch the wall", TASKS["push"])
+        'three times; but do not touch the wall'
+    """
+    text, aside, _ = instruction(skill)
+    marked = mark_objects(text, task)
+    ignored = _unused(marked, task)
+    ignored += _BESIDE.findall(marked)
+    if (later := _LATER.search(text)) and (later[2] in MOTIONS or command_form(later[2])):
+        ignored.append(later[1])
+    return "; ".join([*ignored, *([aside] if aside else [])])
+
+
+def _unused(marked: str, task: Task) -> list[str]:
+    """Return the words that the parser of steps does not use, in a text with marked objects."""
+    runs = groupby(_tokens(marked), lambda word: _is_used(word, task))
+    return [" ".join(run) for is_used, run in runs if not is_used]
+
+
+def _tokens(marked: str) -> list[str]:
+    """Split a text with marked objects into words, with "<>" for each object."""
+    return re.findall(r"<>|[\w'-]+", re.sub(r"<[^>]*>(?:'s)?", "<>", marked))
+
+
+def _is_used(word: str, task: Task) -> bool:
+    """Return whether the parser of steps uses a word."""
+    form = re.sub(r"(?:ed|es|s)$", "ing", word)  # "aligned", "touches"
+    return _used_words(task).issuperset(re.findall(r"\w+", word)) or command_form(form) is not None
+
+
+def has_certain_target(skill: str, task: Task) -> bool:
+    """Return whether the place of a skill is known: not in "opposite of the puck" or "outside the puck".
+
+    Before the last object, an unknown word may only stand inside a noun phrase: "to the standoff pose above the puck".
+    """
+    *before, _ = re.split("(?=<)", mark_objects(skill, task))
+    words = _tokens(before[-1]) if before else []
+    used = [_is_used(word, task) for word in words]
+    return all(
+        is_used or not is_first_used or first in _NOUN_PHRASE
+        for (is_first_used, is_used), first in zip(pairwise(used), words, strict=False)
+    )
+
+
 def mark_objects(text: str, task: Task) -> str:
     """Put each object that a text mentions in <>: "put <robot's gripper> above <mug>"."""
-    text = text.lower()
+    text = respell(text.lower(), task)
     for pattern, name in _names(task).items():
         text = re.sub(rf"(?<![\w<'-])(?:the )?(?:{pattern})(?![\w-])(?![^<]*>)", f"<{name}>", text)
     text = re.sub(r"(<[^>]*>) ?(?:handle|side|top|edge)\b", r"\1", text)
@@ -154,7 +267,7 @@ class StepRole:
 
 
 def motion_of(roles: Sequence[StepRole]) -> StepRole | None:
-    """Return the last role that moves an object, else the last that reaches a place, else None."""
+    """Return the last role that moves an object; otherwise the last that reaches a place; otherwise None."""
     moving = [role for role in roles if role.verb in ("carry", "move", "push", "pull")]
     return next(reversed(moving or [role for role in roles if role.verb == "reach"]), None)
 
@@ -162,8 +275,9 @@ def motion_of(roles: Sequence[StepRole]) -> StepRole | None:
 def role_vectors(roles: Sequence[StepRole]) -> list[list[float]]:
     """Return a vector for each step of a plan that encodes the step's action without its objects.
 
-    The vector is a one-hot verb, a one-hot manner, and flags for the motions that MT10 demonstrates in a special way.
-    Verbs with the same motion share a number. The flags of fallback steps describe the fallback plan's motion.
+    The vector is a one-hot verb, a one-hot manner, and a flag for each (object, target) pair of the plan's motion that
+    MT10's experts move in an unusual way. Verbs with the same motion share an entry. The flags of fallback steps
+    describe the fallback plan's motion.
     """
     vectors = []
     motions = {fallback: motion_of([role for role in roles if role.fallback is fallback]) for fallback in (False, True)}

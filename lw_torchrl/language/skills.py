@@ -125,7 +125,7 @@ def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
 
 @lru_cache(maxsize=256)
 def _foreign_words(task: Task) -> frozenset[str]:
-    """Return the last words of the objects in the 50 tasks that are not words of this task's objects."""
+    """Return the last words of all object names in the 50 tasks, without words in the names of this task's objects."""
     own = {word for name in task.object_names for word in name.split()}
     return frozenset(named.name.split()[-1] for each in TASKS.values() for named in each.published.objects) - own
 

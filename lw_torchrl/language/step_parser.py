@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from lw_torchrl.language.expressions import TRUE
 from lw_torchrl.language.objects import GOAL, GRIPPER, WORDS
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.polarity import instruction, rests, source_of, without_source
 from lw_torchrl.language.queries import Clause, Query
-from lw_torchrl.language.roles import Direction, Verb, mark_objects, simplify
+from lw_torchrl.language.roles import Direction, Verb, ignored_words, mark_objects, simplify
 from lw_torchrl.language.tasks import Task, first_object, is_goal, object_of, same_object, whole_objects
 
 _VERBS = {name: frozenset(words) for name, words in WORDS["canonical"]["verbs"].items()}
@@ -47,9 +48,10 @@ def _stated(step: PlanStep) -> tuple[Clause, ...]:
 
 
 def compared_with_gripper(step: PlanStep) -> tuple[str, ...]:
-    """Return the objects that a step's condition compares with the gripper, in the condition's order."""
+    """Return the objects, except obstacles, that a step's condition compares with the gripper, in its order."""
     pairs = [(clause.subject, clause.object) for clause in _stated(step) if clause.object is not None]
-    return tuple(second if first == GRIPPER else first for first, second in pairs if GRIPPER in (first, second))
+    names = (second if first == GRIPPER else first for first, second in pairs if GRIPPER in (first, second))
+    return tuple(name for name in names if not is_obstacle(name))
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class _Facts:
     not_aligned: bool
     open: bool
     closed: bool
-    near: tuple[str, ...]  # the objects that the gripper is compared with
+    near: tuple[str, ...]  # the objects, except obstacles, that the gripper is compared with
 
     @classmethod
     def of(cls, step: PlanStep) -> _Facts:
@@ -70,7 +72,7 @@ class _Facts:
         for clause in step.condition.implied:
             if clause.subject == GRIPPER and clause.object is None:
                 facts["open" if (clause.predicate == "open") != clause.negated else "closed"] = True
-            elif clause.object is not None and GRIPPER in (clause.subject, clause.object):
+            elif GRIPPER in (pair := (clause.subject, str(clause.object))) and not any(map(is_obstacle, pair)):
                 relation = "at" if clause.predicate in ("near", "around") else "aligned"
                 facts[f"not_{relation}" if clause.negated else relation] = True
         return cls(near=compared_with_gripper(step), **facts)
@@ -83,7 +85,7 @@ def is_free(step: PlanStep) -> bool:
 
 
 def is_obstacle(name: str) -> bool:
-    """Return whether an object is named as something to move over or around."""
+    """Return whether an object's name denotes an obstacle to move over or around."""
     return not _OBSTACLES.isdisjoint(name.split())
 
 
@@ -91,12 +93,15 @@ def parse_steps(plan: ConditionalPlan) -> tuple[ParsedStep | None, ...]:
     """Parse each step of a plan; a step that cannot be parsed becomes None."""
     task = plan.definition
     facts = [_Facts.of(step) for step in plan.steps]
-    marked = [mark_objects(step.skill, task) for step in plan.steps]
+    marked = [_marked(step.skill, task) for step in plan.steps]
     parsed = _parse(plan, _resolve_it([simplify(text) for text in marked], facts, task), facts)
     # If no step has a motion, a motion may be in the second half of a step: "grab it and pull".
     if all(each is None or each.verb in _NO_MOTION for each in parsed):
         parsed = _parse(plan, _resolve_it([_last_clause(text) for text in marked], facts, task), facts)
-    return parsed
+    return tuple(
+        replace(each, confidence=min(each.confidence, 0.8)) if each and ignored_words(step.skill, task) else each
+        for step, each in zip(plan.steps, parsed, strict=True)
+    )
 
 
 def skill_effect(skill: str, task: Task) -> Query | None:
@@ -107,7 +112,7 @@ def skill_effect(skill: str, task: Task) -> Query | None:
         >>> print(skill_effect("move above the puck", TASKS["push"]))
         the robot's gripper is above the puck
     """
-    step, text = PlanStep(Query(TRUE), skill), simplify(mark_objects(skill, task))
+    step, text = PlanStep(Query(TRUE), skill), simplify(_marked(skill, task))
     parsed = _StepParser(step, task, text, _Facts.of(step), grasping=True).parse()
     if parsed is None or parsed.moved is None or parsed.confidence < 0.6:
         return None
@@ -125,16 +130,28 @@ def skill_effect(skill: str, task: Task) -> Query | None:
     return None
 
 
+def _marked(skill: str, task: Task) -> str:
+    """Mark the objects in a skill, and remove what it forbids; return "" if no certain action remains."""
+    text, _, exception = instruction(skill)
+    return "" if exception or rests(text) else mark_objects(text, task)
+
+
 # "it" right after the verb; elsewhere ("close around it") the condition identifies the object.
 _IT = re.compile(r"^(\w+) (?:it|them|her|him)\b")
+_MOVES = f"(?:{'|'.join(sorted((_VERBS['push'] | _VERBS['pull']) - {'close', 'shut'}))})"
 _NO_MOTION = {"approach", "beside", "descend", "close", "open"}
 
 
 def _last_clause(text: str) -> str:
-    """Return the last clause of a step, with "it" resolved: "grab <mug> and pull it back" gives "pull <mug> back"."""
-    first, _, second = text.rpartition(" and ")
-    name = next((name for name in re.findall(r"<[^>]*>", first) if name != f"<{GRIPPER}>"), "it")
-    return simplify(re.sub(r"\b(?:it|them)\b", name, second, count=1)) if first else simplify(text)
+    """Return the last clause of a step, with "it" resolved: "grab <mug> and pull it back" gives "pull <mug> back".
+
+    If the gripper is the object of a motion, the touched object is meant: "turn <gripper> left" gives "turn it left".
+    """
+    *first, second = re.split(rf" and | to (?={_MOVES} )", text)
+    name = next((name for name in re.findall(r"<[^>]*>", "".join(first)) if name != f"<{GRIPPER}>"), "it")
+    text = simplify(re.sub(r"\b(?:it|them)\b", name, second, count=1) if first else second)
+    text = re.sub(rf"^({_MOVES}) <{GRIPPER}>(.*?)(?: (?:in|into|on|onto|against|to|around))* (<.*)", r"\1 \3\2", text)
+    return re.sub(rf"^({_MOVES}) <{GRIPPER}>", r"\1 it", text)
 
 
 def _parse(plan: ConditionalPlan, texts: list[str], facts: list[_Facts]) -> tuple[ParsedStep | None, ...]:
@@ -167,16 +184,21 @@ def _only_sent(step: ParsedStep | None, text: str) -> ParsedStep | None:
     return replace(step, verb="reach") if step and goes_to else step
 
 
+def _plain(text: str) -> list[str]:
+    """Return the words of a text without the names of objects."""
+    return re.sub(r"<[^>]*>", " ", text).split()
+
+
 def _is_fist(text: str, facts: _Facts, is_first: bool) -> bool:
-    """Return whether "close the gripper" closes it before it is at an object, to push with closed fingers."""
+    """Return whether "close the gripper" closes the fingers before they are at an object, in order to push it."""
     is_bare = text.startswith("close ") and "<" not in text.replace(f"<{GRIPPER}>", "")
     return is_bare and (bool(facts.near) or is_first) and not facts.at
 
 
 def _grasps(text: str, facts: _Facts, is_first: bool) -> bool:
-    """Return whether a step grasps or carries an object, or has the condition of a closed gripper at an object."""
-    verb, *rest = text.split()
-    if _is_fist(text, facts, is_first):
+    """Return whether a step grasps or carries an object, or requires that the gripper is closed at an object."""
+    verb, *rest = text.split() or [""]
+    if not text or _is_fist(text, facts, is_first):
         return False
     if verb in _VERBS["held"] and rest and rest[0].startswith("<") and not text.startswith(f"{verb} <{GRIPPER}>"):
         return True
@@ -202,16 +224,22 @@ class _StepParser:
     def __init__(self, step: PlanStep, task: Task, text: str, facts: _Facts, grasping: bool) -> None:
         self.step, self.task, self.text, self.facts, self.grasping = step, task, text, facts, grasping
         text = _PURPOSE.sub("", text)
-        self.verb, *rest = re.sub(r"<[^>]*>", " ", text).split() or [""]
+        self.verb, *rest = _plain(text) or [""]
         self.words = set(rest)
-        named = re.findall(r"<([^>]*)>", text)
-        self.by_hand = named[:1] == [GRIPPER]
-        self.named = [name for name in named if name != GRIPPER]
+        self.by_hand = re.findall(r"<([^>]*)>", text)[:1] == [GRIPPER]
+        starts, text = re.findall(r"<([^>]*)", source_of(text) or ""), without_source(text)
+        self.first = first_object(task)
+        named = [name for name in re.findall(r"<([^>]+)>", text) if name != GRIPPER]
+        self.named = [name for name in named if not is_obstacle(name) or name == self.first]
+        # "over the wall" and "around the wall" describe the way, not the target.
+        self.obstacle = next((name for name in named if name not in self.named), None)
+        self.leaves = any(not self.named or not same_object(task, name, self.named[0]) for name in starts)
+        # "move the gripper away from the mug" has no target that a step can have.
+        self.only_leaves = bool(starts) and not self.named and (self.by_hand or self.verb not in _VERBS["lift"])
         self.tool = match[1] if (match := _TOOL.search(text)) else None
         if self.tool is not None:
             self.named = [name for name in self.named if name != self.tool] or self.named
-        self.direction = next((_DIRECTIONS[word] for word in rest if word in _DIRECTIONS), None)
-        self.first = first_object(task)
+        self.direction = next((_DIRECTIONS[word] for word in _plain(text)[1:] if word in _DIRECTIONS), None)
         self.near = facts.near[-1] if facts.near else self.first
 
     def parse(self) -> ParsedStep | None:
@@ -222,13 +250,23 @@ class _StepParser:
             return None
         return replace(parsed, confidence=min(parsed.confidence, 0.8 if known else 0.6))
 
+    def undoes(self) -> bool:
+        """Return whether the verb is the opposite of the task's or of a known verb: "unlock" in door-lock, "unshut"."""
+        goals, verb = self.task.name.split("-"), self.verb or self.step.skill.split()[0].lower()  # a noun in "lock it"
+        stem = verb.removeprefix("un")
+        return f"un{verb}" in goals or (stem != verb not in goals and stem in (*goals, *_KNOWN))
+
     def _parse(self) -> ParsedStep | None:
+        if not self.text or self.undoes():
+            return None
         if self.first is None:
             elsewhere = self.named and not any(is_goal(self.task, name) for name in whole_objects(self.task))
             target = self.named[-1] if elsewhere else GOAL
             return ParsedStep("hold" if self.verb in _VERBS["hold"] else "reach", GRIPPER, target)
         noun = self.named[0] if self.named else self.near
-        if noun is None or _IDLE.fullmatch(self.text):
+        if noun is None or _IDLE.fullmatch(self.text) or self.only_leaves:
+            return None
+        if self.verb in _KNOWN and self.text.startswith(f"{self.verb} <{self.obstacle}>"):  # "push the wall away"
             return None
         if is_goal(self.task, noun) and not self.by_hand and self.verb not in _VERBS["go"]:
             at_goal = self.near is None or is_goal(self.task, self.near)
@@ -253,8 +291,8 @@ class _StepParser:
 
     def _by_hand(self) -> ParsedStep | None:
         """Parse a step that moves the gripper and the object that the gripper holds, if any."""
-        target = self.named[-1] if self.named else self.near
-        if target is None:
+        target = self.named[-1] if self.named else self.obstacle or self.near
+        if target is None or (not self.named and self.words & {"back", "backward", "backwards"}):
             return None
         holds = self.grasping and (self.facts.closed or self.facts.at)
         if is_goal(self.task, target):
@@ -265,23 +303,27 @@ class _StepParser:
         above = bool(self.words & _PLACES["above"])
         if self.grasping and self.facts.closed and self.facts.at and (above or "to" in self.words):
             elsewhere = self.near is None or not same_object(self.task, target, self.near)
+            elsewhere = elsewhere and target != self.obstacle
             return ParsedStep("carry", self.first, target if elsewhere else GOAL)
-        if above or self.verb == "raise":
+        if above or self.verb == "raise" or (not self.named and (self.verb == "lift" or self.direction == "up")):
             return ParsedStep("approach", GRIPPER, target)
         if self.words & (_PLACES["beside"] | {"front", "behind"}):
             side: Direction | None = "away" if "front" in self.words else "toward" if "behind" in self.words else None
             return ParsedStep("beside", GRIPPER, target, side)
         if self.verb == "align":
             return ParsedStep("descend" if self.facts.aligned else "approach", GRIPPER, target)
-        down = self.verb in ("lower", "drop") or self.words & _PLACES["around"]
-        far = self.facts.not_aligned and not self.facts.aligned and not self.facts.not_at
+        down = self.verb in ("lower", "drop") or (self.words & _PLACES["around"] and not self.obstacle)
+        far = bool(self.obstacle) or (self.facts.not_aligned and not self.facts.aligned and not self.facts.not_at)
         return ParsedStep("approach" if far and not down else "descend", GRIPPER, target)
 
-    def _object_moved(self, noun: str) -> ParsedStep:
+    def _object_moved(self, noun: str) -> ParsedStep | None:
         """Parse a step that moves an object."""
-        if is_obstacle(noun) and not self.grasping:  # "move forward over the wall"
-            return ParsedStep("approach", GRIPPER, noun)
+        if self.obstacle and not self.named and not self.grasping:  # "move forward over the wall"
+            return ParsedStep("approach", GRIPPER, self.obstacle)
         target = self._target(noun)
+        if self.leaves and (target is None or target not in self.named):  # "pull the wrench off the peg"
+            up = self.direction or "up"
+            return ParsedStep("move", noun, noun, up) if self.grasping else ParsedStep("pull", GRIPPER, noun, up)
         if (both := re.search(rf"<{re.escape(noun)}> and <([^>]*)>", self.text)) and self.verb in _VERBS["pull"]:
             noun = both[1]  # "pull <stick> and <thermos>": the stick is the tool
         moved = self.tool if self.tool is not None and (target is None or not is_goal(self.task, target)) else noun
@@ -294,7 +336,8 @@ class _StepParser:
         # A plan that grasps moves the held object; any other plan pushes or pulls with the gripper.
         if self.grasping:
             if target is not None:
-                return ParsedStep("carry" if carries or self.words & _PLACES["above"] else "move", moved, target)
+                carries = carries or bool(self.obstacle or self.words & _PLACES["above"])
+                return ParsedStep("carry" if carries else "move", moved, target)
             if lifts or direction is not None:
                 return ParsedStep("move", moved, moved, "up" if lifts else direction)
             return ParsedStep("carry" if carries else "move", moved, GOAL, confidence=0.7)
@@ -313,15 +356,14 @@ class _StepParser:
         if goals := [name for name in self.named if is_goal(self.task, name)]:
             return goals[-1]
         for name in reversed(self.named[1:] if self.tool is None else self.named):
-            if is_obstacle(name):
-                continue
             if not same_object(self.task, name, noun) or self.tool is not None:
                 return name
-        own, target = self.tool or noun, None
+        own, target = self.tool or noun, GOAL if self.obstacle else None
         for first, second in self._pairs():
             is_first, is_second = same_object(self.task, first, own), same_object(self.task, second, own)
             if is_first != is_second:
-                target = second if is_first else first
+                other = second if is_first else first
+                target = GOAL if is_obstacle(other) else other
         return target
 
     def _pairs(self) -> list[tuple[str, str]]:

@@ -19,8 +19,8 @@ Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 
 
 def as_plans(plans: AnyPlans, argument: str = "plans") -> Plans:
-    """Convert a mapping to :class:`Plans`; the parts of a policy need nothing else of the language side."""
-    from lw_torchrl.language.plans import as_plans as convert  # here, so that parts do not import the parsers
+    """Convert a mapping to :class:`Plans`. Importing this function does not import the parsers of plans."""
+    from lw_torchrl.language.plans import as_plans as convert  # here, so that modules of policies import no parser
 
     return convert(plans, argument)
 
@@ -88,8 +88,10 @@ class PlanTables:
     Attributes:
         index: the index from task ids to the T rows.
         mask: (T, S) bool, true for plan steps, false for padding.
-        turns: (T, 6, S) bool, masks of the steps of each turn, in a cycle: the plan's own; those of the fallback that
-            let go; with its first motion; the plan's own; that let go; with its second. Without a fallback, all steps.
+        turns: (T, 6, S) bool, masks of the steps that a policy may choose in each turn of a cycle: the plan's own
+            steps, the fallback steps that release the object, the fallback steps with the first motion; then the plan's
+            own and the releasing steps again, and the fallback steps with the second motion. Without a fallback, each
+            turn has all steps.
         skill_index: (T, S) int64, the index of each plan step's skill in ``plans.skills``; 0 for padding.
         number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
     """
@@ -116,7 +118,7 @@ class PlanTables:
         self.number = torch.tensor([numbers[task] for task in self.index.tasks])
 
     def rows(self, task_id: Tensor) -> Tensor:
-        """Map task ids (...) int64 to rows (...) int64; raise a ValueError for tasks without a plan."""
+        """Map task ids (...) int64 to rows (...) int64; raise ValueError for tasks without a plan."""
         return self.index.rows(task_id, self._problem)
 
     def refuse_others(self, number: Tensor | None, rows: Tensor) -> None:
@@ -172,7 +174,7 @@ class TaskTables(nn.Module, Generic[Tables]):
         self._last: tuple[Tensor, _Kind, Tables] | None = None
 
     def plain(self, *tensors: Tensor) -> bool:
-        """Return whether the tensors and the tables hold numbers; in ``vmap`` or while compiling they do not."""
+        """Return whether the tensors and the tables have concrete values: not in ``vmap``, and not while compiling."""
         return plain(*tensors, next(iter(self._buffers.values())))  # type: ignore[arg-type]
 
     def select(self, task_id: Tensor, observation: Tensor) -> Tables:

@@ -101,7 +101,7 @@ class Task:
         with suppress(TaskError):
             if Task.from_json(self.name, row) == self:
                 return {key: value for key, value in row.items() if value}
-        raise TaskError(f"task {self.name!r} cannot be written as a row of tasks.toml, got objects {self.objects!r}")
+        raise TaskError(f"a row of tasks.toml cannot express the objects of task {self.name!r}, got {self.objects!r}")
 
     @classmethod
     def from_json(cls, name: str, row: Any, layout: Layout = METAWORLD) -> Task:
@@ -296,7 +296,9 @@ def one_layout(tasks: Iterable[Task]) -> Layout:
 
 @typed
 def load_tasks(path: AnyPath) -> Tasks:
-    """Return the 50 Meta-World tasks by name, with the tasks of a file added or replacing those of the same name.
+    """Load tasks from a file, and return them with the 50 Meta-World tasks, by name.
+
+    A task of the file replaces a Meta-World task with the same name.
 
     Pass one of the returned tasks wherever a task is accepted, or the whole mapping as the ``tasks`` of
     :func:`~lw_torchrl.load_plans` and :func:`~lw_torchrl.resolve_tasks`.

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from lw_torchrl.language.plans import AnyPlans
 
 TRUE_LOGIT = 5.0  # logit of a true condition; a false condition has -5 (paper, section "Plan Conditioning")
-ACTIVE_WEIGHT = 0.01  # a plan step with more attention is active; a false step has about 1e-4 if another step is true
+# A plan step with more attention is active. If any condition is true, a step with a false condition gets about 1e-4.
+ACTIVE_WEIGHT = 0.01
 
 
 def attend(logits: Tensor, mask: Tensor) -> Tensor:
@@ -28,7 +29,7 @@ def attend(logits: Tensor, mask: Tensor) -> Tensor:
 
 
 def read_truth(tensordict: TensorDictBase, keys: Keys, tables: PlanTables) -> tuple[Tensor, Tensor]:
-    """Read truth values (..., S) and each task's row (...) in ``tables``; raise if the truth belongs to other plans."""
+    """Return truth values (..., S) and each task's row (...) in ``tables``; raise ValueError for other plans' truth."""
     qaf, task_id = read(tensordict, keys)
     return answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), tables)
 
@@ -46,9 +47,9 @@ def check_truth(qaf: Tensor, shape: torch.Size) -> None:
 
 
 class PlanAttention(Part):
-    """An attention over a plan's steps: the softmax of 10·truth - 5 over the steps that the plan has.
+    """A module that computes attention over the steps of each row's plan: the softmax of 10·truth - 5.
 
-    If no condition is true, the attention is uniform over the plan's steps.
+    Padding steps get no attention. If no condition is true, the attention is uniform over the plan's steps.
 
     Reads ``qaf`` (B, S) bool, or float in [0, 1] for soft truth, and ``task_id`` (B,) int64; for plans with fallback
     steps also ``turn`` (B,) int64, see :class:`~lw_torchrl.transforms.FallbackTurns` (0 if absent). Writes
@@ -60,8 +61,8 @@ class PlanAttention(Part):
 
     Raises:
         ValueError: at call time, if ``qaf`` has the wrong number of steps, holds values outside [0, 1] or belongs
-            to other plans, or if a task has no plan. A wider ``qaf`` is accepted if ``qaf_plan`` shows that the plans
-            agree.
+            to other plans, or if a task has no plan. A wider ``qaf`` is accepted if ``qaf_plan`` shows that it belongs
+            to the same plans.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -85,7 +86,7 @@ class PlanAttention(Part):
         super().__init__(("qaf", "task_id", "turn")[: 2 + has_fallback], ("skill_weights",), in_keys, out_keys)
         self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout
         self.tables, self.has_fallback = tables, has_fallback
-        # (T, 6, S) bool: the steps of each turn; without a fallback, all masks are all steps.
+        # (T, 6, S) bool, the steps that each turn allows (see FallbackTurns); without a fallback plan, all steps.
         self.register_buffer("mask", tables.turns, persistent=False)
 
     @property
@@ -99,7 +100,7 @@ class PlanAttention(Part):
         return self.in_keys[2] if self.has_fallback else None
 
     def with_plans(self, plans: AnyPlans) -> PlanAttention:
-        """Return an attention over the steps of different plans."""
+        """Return a :class:`PlanAttention` for different plans."""
         other = PlanAttention(plans, out_keys=self.out_keys_source)
         # Either module may read a turn, whose key comes last.
         other.in_keys = [*self.in_keys, *other.in_keys[len(self.in_keys) :]][: len(other.in_keys)]
@@ -107,7 +108,7 @@ class PlanAttention(Part):
 
     def weights(self, qaf: Tensor, rows: Tensor, turn: Tensor | None = None) -> Tensor:
         """Return the attention (..., S) float32 for truth (..., S), table rows (...) int64 and turns (...) int64."""
-        # In the flattened mask (6T, S), row 6t + i holds the steps of task t in turn i.
+        # In the flattened mask (6T, S), row 6t + i marks the steps that turn i of task t allows.
         number = self.mask.shape[1]
         mask = pick(self.mask.flatten(0, 1), number * rows if turn is None else number * rows + turn % number)
         check_truth(qaf, mask.shape)

@@ -152,7 +152,7 @@ class PlanConditionedValue(_OnPlanTrunk, Value):
 
 
 class PlanConditionedQValue(_OnPlanTrunk, QValue):
-    """A :class:`QValue` network on the trunk of :func:`plan_trunk`.
+    """A :class:`QValue` network whose trunk is built by :func:`plan_trunk`.
 
     Reads the input keys of :class:`PlanConditionedValue` and ``action`` (B, A) float32; writes the same keys as
     :class:`QValue`.

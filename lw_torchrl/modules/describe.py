@@ -36,8 +36,8 @@ _KEYS = ("in_keys", "out_keys")
 def describe(module: nn.Module) -> dict[str, Any]:
     """Return a module's description, from which :func:`from_description` rebuilds the module with new random weights.
 
-    The description holds the import path of each part's class, and the part's arguments from the attribute ``config``:
-    JSON values, plans, tasks, layouts and other modules.
+    The description contains the import path of each part's class, and the constructor arguments in the part's attribute
+    ``config``: JSON values, plans, tasks, layouts and other modules.
 
     Raises:
         TypeError: a part has no ``config``; the message names the part.
@@ -93,7 +93,7 @@ def _encode(value: Any, plans: list[Plans], path: str) -> Any:
     if isinstance(value, nn.Module):
         return {"module": _encode_module(value, plans, path)}
     if isinstance(value, Plans):
-        # Most parts share the same plans, so a description holds each Plans once.
+        # Most parts share the same plans, so a description contains each Plans object only once.
         if value not in plans:
             plans.append(value)
         return {"plans": plans.index(value)}
@@ -114,7 +114,7 @@ def _join(path: str, name: str) -> str:
 def from_description(
     description: Any, text_encoder: TextEncoder | None = None, parts: Sequence[type[nn.Module]] = ()
 ) -> Any:
-    """Build the module that a description describes, with new random weights.
+    """Build a module from its description, with new random weights.
 
     Args:
         description: a result of :func:`describe`.
@@ -123,10 +123,8 @@ def from_description(
             causes an import, because its file may be untrusted.
 
     Raises:
-        ValueError: ``description`` is malformed, or a class is unknown.
+        ValueError: a class is unknown. A malformed description can raise any error.
     """
-    if not isinstance(description, Mapping) or not isinstance(description.get("plans"), list):
-        raise ValueError(f"description must have the keys class, options and plans, got {shown(description)}")
     plans = [Plans.from_json(row) for row in description["plans"]]
     return _Decoder(plans, text_encoder, parts).module(description)
 
@@ -139,19 +137,13 @@ class _Decoder:
         self.custom |= {f"__main__:{kind.__qualname__}": kind for kind in parts}
 
     def module(self, node: Any) -> Any:
-        if not isinstance(node, Mapping) or not isinstance(node.get("class"), str):
-            raise ValueError(f"a part must have a class, got {shown(node)}")
         name = node["class"]
         if name in _SEQUENCES:
-            parts = node.get("parts")
+            parts = node["parts"]
             if isinstance(parts, Mapping):
                 return _SEQUENCES[name](OrderedDict((key, self.module(part)) for key, part in parts.items()))
-            if not isinstance(parts, list):
-                raise ValueError(f"parts of a {name} must be a list or a dict, got {shown(parts)}")
             return _SEQUENCES[name](*map(self.module, parts))
         kind = self.find(name)
-        if not isinstance(node.get("options"), Mapping):
-            raise ValueError(f"options of a {name} must be a dict, got {shown(node.get('options'))}")
         options = {key: self.value(value) for key, value in node["options"].items()}
         for key in {*_KEYS} & {*options}:  # JSON has no tuples
             options[key] = [tuple(each) if isinstance(each, list) else each for each in options[key]]
@@ -200,7 +192,7 @@ class _Decoder:
             return METAWORLD if content == METAWORLD.name else Layout.from_json(content)
         if kind == "dict":
             return {key: self.value(each) for key, each in content.items()}
-        raise ValueError(f"a value must be a module, plans, a task, a layout or a dict, got {shown(value)}")
+        raise ValueError(f"the description must not contain {shown(value)}, which is no known kind of object")
 
 
 def same_keys(module: nn.Module, other: nn.Module) -> bool:

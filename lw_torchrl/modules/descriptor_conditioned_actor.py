@@ -25,7 +25,7 @@ Condition = Literal["description", "one-hot"]
 
 
 class TaskLatent(Part):
-    """A module that encodes the task's description, or a one-hot vector of the task, to a latent.
+    """A module that encodes the task's description, or a one-hot vector of the task, as a latent.
 
     Reads ``task_id`` (B,) int64; writes ``task_latent`` (B, D) float32.
 
@@ -66,7 +66,7 @@ class TaskLatent(Part):
             vectors = encoded([task.description for task in self.definitions.values()], text_encoder)
         self.index = TaskIndex(task_ids(self.tasks))
         order = [self.tasks.index(task) for task in self.index.tasks]
-        # Matrix products round differently for different numbers of rows, so there are always at least 50 rows.
+        # Matrix products round differently for different numbers of rows, so pad to at least 50 rows.
         fill = vectors.new_zeros(max(0, len(MT50) - len(order)), vectors.shape[1])
         self.register_buffer("vectors", torch.cat((unit_scale(vectors)[order], fill)), persistent=False)
         self.encoder = SkillEncoder() if encoder is None else encoder
@@ -91,7 +91,7 @@ class TaskLatent(Part):
 
 
 def _one_per_row(task_id: Tensor, tensordict: TensorDictBase) -> Tensor:
-    """Return task ids (...) from ids (...) or (..., 1); a last dimension of 1 is removed if an entry lacks it."""
+    """Remove the last dimension of task ids (..., 1) if another entry of the tensordict lacks this dimension."""
     if task_id.shape[-1:] != (1,) or task_id.dim() <= tensordict.batch_dims:
         return task_id
     shapes = [value.shape[: task_id.dim()] for value in tensordict.values(True, True)]

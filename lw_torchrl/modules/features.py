@@ -74,7 +74,7 @@ add_random_module(Features)  # so that losses that vmap over networks let each n
 
 
 class ObservationFeatures(Features):
-    """Normalized features of the observation only.
+    """A module that computes normalized features from the observation alone.
 
     Reads ``observation`` (B, D) float; writes ``features`` (B, F), clipped to 10 standard deviations from the mean.
 
@@ -151,7 +151,6 @@ class ObservationFeatures(Features):
         """Compute the mean and standard deviation of the rows; a nearly constant feature is not rescaled."""
         (observation,) = read(rows, self.in_keys)
         features = self._select(observation.reshape(-1, self.layout.size))
-        check_rows(features)
         if not features.shape[-1]:
             return  # PyTorch warns about the standard deviation of an empty tensor
         if weights is None:
@@ -224,7 +223,8 @@ class Concat(TensorDictModuleBase):
 
 
 def as_features(features: nn.Module | None, layout: Layout, noise: float = 0.0) -> TensorDictModuleBase:
-    """Convert features to a TensorDict module: a plain module reads ``observation``; None gives the differences."""
+    """Return ``features`` as a TensorDict module. A plain module is wrapped to read ``observation``; None becomes
+    :class:`ObservationFeatures` of kind "differences"."""
     if features is None:
         return ObservationFeatures(noise=noise, layout=layout)
     if isinstance(features, TensorDictModuleBase):
@@ -235,20 +235,15 @@ def as_features(features: nn.Module | None, layout: Layout, noise: float = 0.0) 
 
 
 def check_observation(observation: Tensor, layout: Layout) -> None:
-    """Raise a :class:`ValueError` unless observations are floats (..., D), with the D of the layout."""
+    """Raise a :class:`ValueError` unless observations are floats of shape (..., D), where D is the layout's size."""
     if observation.shape[-1:] != (layout.size,) or not observation.is_floating_point():
         got = f"{observation.dtype} of shape {tuple(observation.shape)}"
         raise ValueError(f"observation must be float32 of shape (..., {layout.size}), got {got}")
 
 
-def check_rows(rows: Tensor) -> None:
-    """Raise a :class:`ValueError` if there are no rows to compute statistics from."""
-    if not len(rows):
-        raise ValueError("rows must not be empty: fit needs at least one row")
-
-
 def relative(observation: Tensor, layout: Layout) -> Tensor:
-    """Return the differences between positions of hand, objects and goal, in metres and squashed at 2 cm and 10 cm.
+    """Return the differences between the positions of hand, objects and goal, in metres and squashed by tanh at two
+    scales, 2 cm and 10 cm.
 
     For Meta-World (two objects), observations (..., 39) give (..., 54). Differences to an absent object are 0.
     """
@@ -285,4 +280,4 @@ _KINDS: dict[str, Callable[[Tensor, Layout], Tensor]] = {
     "both": lambda observation, layout: torch.cat((observation, differences(observation, layout)), -1),
 }
 TRANSFERS = ("opening", "none")
-"""The kinds of features that have the same meaning in every layout."""
+"""The kinds of :class:`ObservationFeatures` that have the same meaning in every layout."""

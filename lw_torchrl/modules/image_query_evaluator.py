@@ -15,10 +15,10 @@ from lw_torchrl._util.rendering import check_cameras
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.parts import MLP, materialize
 from lw_torchrl.modules.query_evaluator import Answers, ClauseEvaluator, ClauseNetwork, Clauses
-from lw_torchrl.transforms.camera import CameraTransform
+from lw_torchrl.transforms.observations import CameraTransform
 
 KEYS = 32  # size of the learned vector that represents an object
-_KEPT = 16  # number of features at an object's place from which its position is estimated
+_KEPT = 16  # number of image features at an object's location from which its position is estimated
 _LANDMARKS = 32  # number of landmarks that are located in every picture
 _SHARP = 30.0  # scale of the attention scores; with 1, an untrained network would attend to the whole picture
 _LARGEST = 512  # maximum height and width of a picture, in pixels
@@ -50,9 +50,9 @@ def _conv(before: int, after: int, stride: int = 1) -> nn.Sequential:
 class PointingNetwork(ClauseNetwork):
     """A network that locates objects in pictures and evaluates clauses about their positions.
 
-    In each camera's picture, an object's learned vector is compared with the features at every place, and a softmax
-    over the places attends to the object. From the attended coordinates and features, and from the coordinates of
-    landmarks that all objects share, an MLP estimates the object's position in metres and its opening.
+    For each camera, the network compares an object's learned vector with the image features at every location, and a
+    softmax over the locations attends to the object. From the attended coordinates and features, and from the
+    coordinates of landmarks that all objects share, an MLP estimates the object's position in metres and its opening.
 
     Source: the spatial softmax of 'Deep spatial autoencoders for visuomotor learning' (Finn et al., 2016).
     """
@@ -107,8 +107,8 @@ class PointingNetwork(ClauseNetwork):
 
 
 IMAGE_ENCODERS = Registry("image encoder", "lw_torchrl.image_encoders", {"small": SmallImageEncoder}, is_function)
-"""A registry of factories of picture encoders, which map (n, 3, H, W) float32 in [0, 1] to features (n, F, h, w).
-Register a custom encoder, frozen by ``requires_grad_(False)`` or not, so that saved files can refer to it by name."""
+"""A registry of functions that create image encoders, which map (n, 3, H, W) float32 in [0, 1] to features
+(n, F, h, w). Register a custom encoder so that checkpoints can refer to it by name; its weights may be frozen."""
 
 
 class ImageQueryEvaluator(ClauseEvaluator):
@@ -119,8 +119,8 @@ class ImageQueryEvaluator(ClauseEvaluator):
     network. ``transform()`` returns the :class:`CameraTransform` that renders the pictures.
 
     Args:
-        plans, answers, predicates: see :class:`~lw_torchrl.modules.query_evaluator.ClauseEvaluator`, also for the
-            errors.
+        plans, answers, predicates: see :class:`~lw_torchrl.modules.query_evaluator.ClauseEvaluator`, which also lists
+            the errors.
         cameras, height, width: see :class:`CameraTransform`; height and width are at most 512 pixels.
         every: render a picture every N time steps; the answers stay the same in between.
         encoder: a name in :data:`IMAGE_ENCODERS`.
@@ -165,9 +165,11 @@ class ImageQueryEvaluator(ClauseEvaluator):
         self.in_keys = ["pixels", "task_id"]
         check_choice("encoder", encoder, IMAGE_ENCODERS)
         image_encoder = IMAGE_ENCODERS[encoder]()
+        with torch.no_grad():
+            _, features, _, _ = image_encoder(torch.zeros(1, 3, height, width, dtype=torch.float32)).shape
         self.network = PointingNetwork(
             image_encoder,
-            _num_features(image_encoder, encoder, height, width),
+            features,
             cameras=len(self.cameras),
             names=len(self.names),
             width=hidden,
@@ -186,14 +188,3 @@ class ImageQueryEvaluator(ClauseEvaluator):
         if seen.shape[-3:] != shape or seen.dtype != torch.uint8:
             got = f"{seen.dtype} of shape {tuple(seen.shape)}; evaluator.transform() writes them"
             raise ValueError(f"pixels must be uint8 of shape (..., {', '.join(map(str, shape))}), got {got}")
-
-
-@torch.no_grad()
-def _num_features(encoder: nn.Module, name: str, height: int, width: int) -> int:
-    """Return F, the number of channels of an encoder's feature map."""
-    features = encoder(torch.zeros(1, 3, height, width, dtype=torch.float32))
-    is_tensor = isinstance(features, Tensor)
-    if not is_tensor or features.dim() != 4 or len(features) != 1 or not features.is_floating_point():
-        got = tuple(features.shape) if is_tensor else type(features).__name__
-        raise ValueError(f"encoder {name!r} must return a feature map (n, F, h, w), got {got}")
-    return features.shape[1]

@@ -1,4 +1,4 @@
-"""Mixers of skills by attention: SkillMixer mixes latents, ActionMixer mixes the actions decoded from latents."""
+"""SkillMixer: a module that mixes the latents of skills by attention."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def unit_scale(vectors: Tensor) -> Tensor:
-    """Rescale vectors (n, E) to an RMS of 1: a freshly initialized network can hardly distinguish smaller vectors."""
+    """Rescale vectors (n, E) to an RMS of 1, because a new network can hardly distinguish smaller vectors."""
     vectors = vectors.to(torch.float32)
     return vectors / vectors.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-6)
 
@@ -43,56 +43,11 @@ class SkillEncoder(MLP):
         self.config = {"latent_size": latent_size, "width": width, "depth": depth}
 
 
-class _Mixer(Part):
-    """Base class for mixers. A mixer holds one vector per distinct skill and, for each plan step, the index of its
-    skill.
-    """
-
-    index: Tensor
-    vectors: Tensor
-
-    def _encode(self, plans: AnyPlans, encoder: nn.Module | None, text_encoder: TextEncoder | None) -> None:
-        self.plans, self.text_encoder = as_plans(plans), text_encoder
-        self.tables = PlanTables(self.plans)
-        if self.plans.has_roles:
-            index, vectors = _vectors_of_roles(self.plans, self.tables)
-        else:
-            index, vectors = self.tables.skill_index, encoded(self.plans.skills, text_encoder)
-        # The tables are computed from the plans, so the state_dict does not need them.
-        self.register_buffer("index", index, persistent=False)  # (T, S) int64
-        self.register_buffer("vectors", unit_scale(vectors), persistent=False)  # (K, E) float32
-        self.encoder = SkillEncoder() if encoder is None else encoder
-        materialize(self.encoder, self.vectors)
-        if (weight := next(self.encoder.parameters(), None)) is not None:  # the encoder may be on a GPU
-            self.index, self.vectors = self.index.to(weight.device), self.vectors.to(weight)
-        self.latent_size = probe(self.encoder, self.vectors).shape[-1]
-
-    @property
-    def text_vectors(self) -> Tensor | None:
-        """The embeddings (K, E) float32 of the skill texts; None for skills that are encoded by their roles."""
-        return None if self.plans.has_roles else self.vectors
-
-    def with_plans(self, plans: AnyPlans) -> Self:
-        """Return a mixer for different plans that shares the networks: training one also trains the other."""
-        other = type(self)(**{**self.config, "plans": plans, "text_encoder": self.text_encoder})
-        return in_mode_of(self, other.to(self.index.device))
-
-    def latents(self) -> Tensor:
-        """Return the latents (K, D) of the distinct skills."""
-        latents: Tensor = self.encoder(self.vectors)
-        return latents
-
-    def per_skill(self, weights: Tensor, task_id: Tensor, latents: Tensor) -> Tensor:
-        """Sum the attention over plan steps (..., S) to attention over the K distinct skills (..., K)."""
-        zeros = weights.new_zeros((*weights.shape[:-1], len(latents)))
-        rows = self.tables.rows(one_per_row(task_id, weights))
-        return zeros.scatter_add(-1, pick(self.index, rows), weights).to(latents.dtype)
-
-
-class SkillMixer(_Mixer):
+class SkillMixer(Part):
     """A module that encodes each skill's text to a latent, and mixes the latents by attention over the plan's steps.
 
-    If plan steps have roles (see :func:`~lw_torchrl.canonical_plans`), the vectors encode verb and manner, not text.
+    If plan steps have roles (see :func:`~lw_torchrl.canonical_plans`), the module encodes the role's verb and manner
+    instead of the text.
 
     Reads ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes ``skill_latent`` (B, D) float32.
 
@@ -117,6 +72,8 @@ class SkillMixer(_Mixer):
     """
 
     _options = ("plans", "encoder")
+    index: Tensor
+    vectors: Tensor
 
     @typed
     def __init__(
@@ -129,7 +86,41 @@ class SkillMixer(_Mixer):
         out_keys: Keys | None = None,
     ) -> None:
         super().__init__(("skill_weights", "task_id"), ("skill_latent",), in_keys, out_keys)
-        self._encode(plans, encoder, text_encoder)
+        self.plans, self.text_encoder = as_plans(plans), text_encoder
+        self.tables = PlanTables(self.plans)
+        if self.plans.has_roles:
+            index, vectors = _vectors_of_roles(self.plans, self.tables)
+        else:
+            index, vectors = self.tables.skill_index, encoded(self.plans.skills, text_encoder)
+        # The tables are computed from the plans, so the state_dict does not need them.
+        self.register_buffer("index", index, persistent=False)  # (T, S) int64
+        self.register_buffer("vectors", unit_scale(vectors), persistent=False)  # (K, E) float32
+        self.encoder = SkillEncoder() if encoder is None else encoder
+        materialize(self.encoder, self.vectors)
+        if (weight := next(self.encoder.parameters(), None)) is not None:  # the encoder may be on a GPU
+            self.index, self.vectors = self.index.to(weight.device), self.vectors.to(weight)
+        self.latent_size = probe(self.encoder, self.vectors).shape[-1]
+
+    @property
+    def text_vectors(self) -> Tensor | None:
+        """The embeddings (K, E) float32 of the skill texts; None if the module encodes roles instead."""
+        return None if self.plans.has_roles else self.vectors
+
+    def with_plans(self, plans: AnyPlans) -> Self:
+        """Return a mixer for different plans that shares the networks: training one also trains the other."""
+        other = type(self)(**{**self.config, "plans": plans, "text_encoder": self.text_encoder})
+        return in_mode_of(self, other.to(self.index.device))
+
+    def latents(self) -> Tensor:
+        """Return the latents (K, D) of the distinct skills."""
+        latents: Tensor = self.encoder(self.vectors)
+        return latents
+
+    def per_skill(self, weights: Tensor, task_id: Tensor, latents: Tensor) -> Tensor:
+        """Return the attention over the K distinct skills (..., K), given the attention over plan steps (..., S)."""
+        zeros = weights.new_zeros((*weights.shape[:-1], len(latents)))
+        rows = self.tables.rows(one_per_row(task_id, weights))
+        return zeros.scatter_add(-1, pick(self.index, rows), weights).to(latents.dtype)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -137,55 +128,6 @@ class SkillMixer(_Mixer):
         latents = self.latents()
         # One matrix product over the K skills is faster than gathering a latent for each step (B, S, D).
         return write(tensordict, self, [self.per_skill(weights, task_id, latents) @ latents])
-
-
-class ActionMixer(_Mixer):
-    """A module that decodes each skill's latent to an action, and mixes the actions by attention over the plan's steps.
-
-    This module replaces :class:`SkillMixer` and the decoder. Reads ``skill_weights`` (B, S) float32, ``task_id``
-    (B,) int64 and ``features`` (B, F) float32; writes ``action`` (B, A) float32.
-
-    Args:
-        plans, encoder, text_encoder, in_keys, out_keys: see :class:`SkillMixer`.
-        decoder: a module that maps a latent and the features (..., D + F) float32 to an action (..., A).
-
-    Example:
-        >>> import lw_torchrl as lw
-        >>> from tensordict.nn import TensorDictSequential
-        >>> plans = lw.load_plans("MT10")
-        >>> parts = lw.modules.PlanAttention(plans), lw.modules.ObservationFeatures()
-        >>> actor = TensorDictSequential(*parts, lw.modules.ActionMixer(plans, lw.modules.MLPDecoder()))
-        >>> actor.in_keys
-        ['qaf', 'task_id', 'observation']
-
-    Source: mixtures of experts; the paper mixes latents instead of actions.
-    """
-
-    _options = ("plans", "decoder", "encoder")
-
-    @typed
-    def __init__(
-        self,
-        plans: AnyPlans,
-        decoder: nn.Module,
-        encoder: nn.Module | None = None,
-        *,
-        text_encoder: TextEncoder | None = None,
-        in_keys: Keys | None = None,
-        out_keys: Keys | None = None,
-    ) -> None:
-        super().__init__(("skill_weights", "task_id", "features"), ("action",), in_keys, out_keys)
-        self._encode(plans, encoder, text_encoder)
-        self.decoder = decoder
-
-    @dispatched
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        weights, task_id, features = read(tensordict, self.in_keys)
-        latents = self.latents()
-        shape = *features.shape[:-1], *latents.shape
-        inputs = torch.cat((latents.expand(shape), features.unsqueeze(-2).expand(*shape[:-1], -1)), -1)
-        actions = self.decoder(inputs)  # (..., K, A)
-        return write(tensordict, self, [(self.per_skill(weights, task_id, latents).unsqueeze(-1) * actions).sum(-2)])
 
 
 def _vectors_of_roles(plans: Plans, tables: PlanTables) -> tuple[Tensor, Tensor]:

@@ -43,7 +43,7 @@ class MLP(TorchRLMLP):
             norm_class=nn.LayerNorm if layer_norm else None,
             norm_kwargs=[{"normalized_shape": cells} for cells in widths] if layer_norm else None,
         )
-        self.float()  # whatever torch.get_default_dtype() is
+        self.float()  # independent of torch.get_default_dtype()
 
 
 @torch.no_grad()
@@ -106,9 +106,10 @@ class Part(TensorDictModuleBase):
 
 
 class RenamedInputs(TensorDictModuleBase):
-    """A base class of modules whose ``in_keys`` can be assigned, which renames the keys that their submodules read.
+    """A base class of modules with assignable ``in_keys``.
 
-    Other modules that share these submodules keep their own keys.
+    Assigning keys also renames the keys that the submodules read. Other modules that share these submodules keep their
+    own keys.
     """
 
     @property
@@ -187,7 +188,9 @@ class NamedParts(RenamedInputs, TensorDictSequential):
             # A misspelt part name would create an attribute that nothing uses. Users' subclasses may add modules.
             if parts and isinstance(value, nn.Module) and type(self).__module__.startswith("lw_torchrl."):
                 available = f"{type(self).__name__} has the parts {', '.join(parts)}"
-                raise AttributeError(f"{available}, but no {name}; set a part's modules like actor.mixer.encoder")
+                raise AttributeError(
+                    f"{available}, but no {name}; set a module of a part as in actor.mixer.encoder = ..."
+                )
             super().__setattr__(name, value)
             return
         if not isinstance(value, nn.Module):
@@ -241,7 +244,7 @@ def _plans_inside(part: nn.Module) -> Any:
 
 
 def follow(part: Any, plans: AnyPlans) -> Any:
-    """Return a part that follows different plans but shares the networks; a part without plans is returned unchanged.
+    """Return a part that follows ``plans`` with the networks of ``part``; return a part without plans unchanged.
 
     Raises:
         TypeError: the part follows plans but has no method ``with_plans``.

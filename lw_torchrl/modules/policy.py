@@ -1,4 +1,4 @@
-"""Functions that make a policy, and that return the plans, tasks, layout and transforms of any actor."""
+"""Create policies, and find the plans, tasks, layout and transforms of any actor."""
 
 from __future__ import annotations
 
@@ -93,7 +93,8 @@ def layout_of(actor: Any) -> Layout:
 
 
 def draws(actor: Any) -> bool:
-    """Return whether an actor draws random numbers without exploration, so that actions depend on earlier calls."""
+    """Return whether an actor draws random numbers even without exploration, so that its actions depend on earlier
+    calls."""
     return any(getattr(part, "draws", False) for part in _parts(actor))
 
 
@@ -111,7 +112,7 @@ def with_plans(actor: Any, plans: AnyPlans) -> Any:
 
 
 def transform_of(actor: Any, plans: Plans | None = None) -> Transform | None:
-    """Return a new transform that writes the keys that an actor reads but an environment lacks; None if not needed.
+    """Return a new transform that writes the keys that an actor reads but an environment lacks; None if it lacks none.
 
     Args:
         actor: any actor; the transforms of parts with a method ``transform()`` are included.

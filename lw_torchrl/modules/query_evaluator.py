@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchrl.envs import Transform
 from torchrl.modules import MLP
 
-from lw_torchrl._util.checks import Count, check_choice, shown, typed, unknown_name
+from lw_torchrl._util.checks import Count, check_choice, shown, typed
 from lw_torchrl._util.keys import dispatched, key_beside, read, write
 from lw_torchrl.language.expressions import Expression
 from lw_torchrl.language.gates import Gates, Operand, Shapes, compile_gates, evaluate_gates
@@ -32,10 +32,10 @@ Answers = Literal["soft", "hard"]
 
 
 class QueryEvaluator(TensorDictModuleBase):
-    """A base class of modules that answer plan conditions for a policy: ``TensorDictSequential(evaluator, actor)``.
+    """A base class of modules that answer plan conditions for a policy.
 
-    Training the sequence trains both modules. A subclass implements :meth:`logits`, and adds the keyword arguments of
-    its constructor to ``config``.
+    Training ``TensorDictSequential(evaluator, actor)`` trains both modules. A subclass implements :meth:`logits`, and
+    adds the keyword arguments of its constructor to ``config``.
 
     Reads ``in_keys``, by default ``observation`` (B, 39) float32 and ``task_id`` (B,) int64. Writes ``qaf_logits``
     (B, S) float32, positive where the condition of a plan step holds, in the order of the plan, and ``qaf`` (B, S)
@@ -43,9 +43,9 @@ class QueryEvaluator(TensorDictModuleBase):
 
     Args:
         plans: the plans whose conditions the module answers.
-        answers: "soft": ``qaf`` is the probability, the sigmoid of the logit. "hard": ``qaf`` is 1 where the logit is
-            positive and 0 elsewhere, with the gradient of "soft"; for a policy that was trained on exact answers. A
-            subclass that overrides the constructor must accept ``answers`` to support "hard".
+        answers: the kind of answers in ``qaf``. "soft" is the probability, the sigmoid of the logit. "hard" is 1 where
+            the logit is positive and 0 elsewhere, with the gradient of "soft"; use it for a policy that was trained on
+            exact answers. A subclass that overrides the constructor must accept ``answers`` to support "hard".
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -97,7 +97,8 @@ class QueryEvaluator(TensorDictModuleBase):
     def answers(self, answers: Answers) -> None:
         self._answers: Answers = check_choice("answers", answers, ("soft", "hard"))
         if answers != "soft" and not self._accepts_answers:  # a saved file would lose the value
-            raise TypeError(f"the constructor of {type(self).__name__} must accept answers=, got answers={answers!r}")
+            name = type(self).__name__
+            raise TypeError(f"{name} supports only answers='soft', got {answers!r}; add answers= to its constructor")
 
     def logits(self, *read: Any, **_: Any) -> Tensor:  # a subclass may have any signature
         """Return the logits (B, S) float32 for the tensors of ``in_keys``."""
@@ -119,7 +120,7 @@ class QueryEvaluator(TensorDictModuleBase):
         qaf = logits.sigmoid()
         if self.answers == "hard":
             qaf = (logits > 0).to(qaf.dtype) + (qaf - qaf.detach())  # straight-through: the gradient of the sigmoid
-        if "task_id" in self.in_keys:  # by the plan's number, an actor with other plans rejects the answers
+        if "task_id" in self.in_keys:  # the plan's number lets an actor reject answers to other plans
             rows = self.plan_tables.rows(tensordict.get("task_id"))
             tensordict.set(key_beside(self.out_keys_source[0], "_plan"), pick(self.plan_number, rows))
         return write(tensordict, self, [qaf, logits])
@@ -129,7 +130,7 @@ class QueryEvaluator(TensorDictModuleBase):
         return None
 
     def with_plans(self, plans: AnyPlans) -> QueryEvaluator:
-        """Return an evaluator for different plans that shares the weights; RuntimeError if their shapes differ."""
+        """Return an evaluator for different plans that shares the weights; raise RuntimeError if they do not fit."""
         options: dict[str, Any] = dict(self.config)
         if "text_encoder" in signature(type(self)).parameters:
             options["text_encoder"] = self.text_encoder
@@ -145,9 +146,11 @@ class QueryEvaluator(TensorDictModuleBase):
 
 
 def evaluators_of(policy: Any) -> list[QueryEvaluator]:
-    """Return the query evaluators inside a policy, for example in a TensorDictSequential."""
-    modules = policy.modules() if isinstance(policy, nn.Module) else ()
-    return [module for module in modules if isinstance(module, QueryEvaluator)]
+    """Return the query evaluators inside a policy, except evaluators nested in another evaluator."""
+    if isinstance(policy, QueryEvaluator):
+        return [policy]
+    children = policy.children() if isinstance(policy, nn.Module) else ()
+    return list(dict.fromkeys(evaluator for child in children for evaluator in evaluators_of(child)))
 
 
 # --- evaluators of clauses -----------------------------------------------------------------------------------------
@@ -159,8 +162,8 @@ _SCALES = (0.005, 0.02, 0.1, 0.5)  # metres, the scales at which tanh squashes a
 
 
 class Clauses(NamedTuple):
-    """A batch (...,) of clauses, possibly from different tasks. A clause compares elements of an observation by their
-    difference, ``observation[first] - observation[second] + shift``."""
+    """A batch (...,) of clauses, possibly from different tasks. A clause is a predicate of the difference
+    ``observation[first] - observation[second] + shift``, three numbers."""
 
     first: Tensor  # (..., 3) int64, indices into the observation; index D (past the end) reads 0
     second: Tensor  # (..., 3) int64
@@ -168,9 +171,9 @@ class Clauses(NamedTuple):
     predicate: Tensor  # (...) int64, an index into the list of predicates
     negated: Tensor  # (...) bool
     subject: Tensor  # (...) int64, an index into the list of names
-    object: Tensor  # (...) int64, likewise; the number of names for a clause without an object
-    # Only for clauses (T, C) of the plans of T tasks, where each distinct clause of a plan is listed once: the gates
-    # that make conditions of the clauses and of a value that is always true, number C; see Gates.
+    object: Tensor  # (...) int64, an index into the list of names, or its length for a clause without an object
+    # Only for the clauses (T, C) of the plans of T tasks, which list each distinct clause of a plan once: the logic
+    # gates (see Gates) that combine the clauses into conditions. Input C of the gates is a constant, true.
     inputs: Tensor = torch.empty(0, dtype=torch.int64)
     flipped: Tensor = torch.empty(0, dtype=torch.bool)
 
@@ -242,13 +245,9 @@ class ClauseEvaluator(QueryEvaluator):
         name_index = {name: number for number, name in enumerate(self.names)}
         for task, clause in clauses:
             where = f"of {str(clause)!r}, in {task.name}"
-            if clause.predicate not in predicate_index:
-                error = unknown_name(f"predicate {where}", clause.predicate, self.predicates)
-                raise ValueError(f"{error}; train an evaluator with this predicate")
-            for name in (clause.subject, clause.object):
-                if self.names and name is not None and name not in name_index:
-                    error = unknown_name(f"object {where}", name, self.names)
-                    raise ValueError(f"{error}; train an evaluator with this object")
+            check_choice(f"predicate {where}", clause.predicate, self.predicates)
+            for name in filter(None, (clause.subject, clause.object) if self.names else ()):
+                check_choice(f"object {where}", name, self.names)
         first, second, shift = zip(*(_compared(clause, task) for task, clause in clauses), strict=True)
         return Clauses(
             first=torch.tensor(first),
@@ -323,8 +322,11 @@ def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
 
 
 class ClauseNetwork(nn.Module):
-    """A network that maps clauses to logits: a trunk encodes the difference of two positions, and a learned vector of
-    the predicate weights the trunk's output. "not" flips the sign of the logit."""
+    """A network that maps clauses to logits.
+
+    A trunk encodes the difference of two positions. The logit is the dot product of the trunk's output and a learned
+    vector of the predicate, plus a bias. "not" flips the sign of the logit.
+    """
 
     numbers: int = 3  # components of a difference
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lw_torchrl._util.checks import Scale, typed
 from lw_torchrl._util.devices import check_finite
-from lw_torchrl._util.keys import Keys, as_keys, read
+from lw_torchrl._util.keys import Keys, as_keys, key_beside, read
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import GOAL, GRIPPER, NamedObject, coordinate_indices
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, as_plans
@@ -20,12 +20,12 @@ from lw_torchrl.language.roles import VECTORS, StepRole
 from lw_torchrl.language.task_index import PlanTables, one_per_row, pick
 from lw_torchrl.language.tasks import role_object
 from lw_torchrl.modules.attention import PlanAttention
-from lw_torchrl.modules.features import Features, check_observation, check_rows, squash
+from lw_torchrl.modules.features import Features, check_observation, squash
 from lw_torchrl.transforms.qaf import plan_program
-from lw_torchrl.transforms.random_yaw import tilt_key, turn_observation, turn_vectors, yaw_key
+from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
 
 _SCALE = 0.1  # metres, the unit of positions in the features
-_FAR = 0.25  # metres; longer positions, which are rare in demonstrations, are shortened to this length
+_FAR = 0.25  # metres; longer relative positions, which are rare in demonstrations, are shortened to this length
 _LIFTED = 0.15  # metres, the height at which an object is carried above its target
 _AWAY = 0.15  # metres, the distance of the target of "move the puck to the left"
 _KEYS = ("observation", "skill_weights", "task_id")
@@ -57,8 +57,8 @@ class _RelativePositions(Features):
         self.plans = plans = as_plans(plans)
         self.tables = PlanTables(plans)
         self.width = 9 * number
-        # Coordinates are indices into the observation with constants appended. Fixed places are constants. The first
-        # constant is 0, and a missing pair is the difference of two zeros.
+        # Coordinates are indices into the observation followed by constants, the coordinates of fixed positions. The
+        # first constant is 0; a missing pair is the difference of two such zeros.
         constants = [0.0]
         shape = (len(plans), plans.num_steps, number, 3)
         self.layout, size = plans.layout, plans.layout.size
@@ -91,7 +91,7 @@ class _RelativePositions(Features):
         ``rows`` (...) are task indices; ``yaw`` (...) is the angle in radians by which :class:`RandomYaw` rotated the
         observation (..., D).
         """
-        if yaw is not None:  # fixed places and offsets belong to the scene before it was turned
+        if yaw is not None:  # fixed positions and offsets refer to the scene before its rotation
             observation = turn_observation(observation, -yaw, self.layout)
         positions = (weights[..., None, None] * self.of_steps(observation, rows)).sum(-3)
         return positions if yaw is None else turn_vectors(positions, yaw.unsqueeze(-1))
@@ -108,7 +108,7 @@ class _RelativePositions(Features):
         observation, weights, task_id = read(tensordict, self.in_keys)
         check_observation(observation, self.layout)
         check_finite("observation", observation)
-        yaw = tensordict.get(yaw_key(self.in_keys[0]), None)
+        yaw = tensordict.get(key_beside(self.in_keys[0], "_yaw"), None)
         rows = self.tables.rows(one_per_row(task_id, observation))
         return observation.to(self.offset.dtype), weights.to(self.offset.dtype), rows, yaw
 
@@ -118,7 +118,7 @@ class _RelativePositions(Features):
 
 
 def _compared(plan: ConditionalPlan) -> list[list[Pair]]:
-    """Return for each plan step the object pairs of the first and the last clause that compare two objects."""
+    """Return, for each plan step, the objects in the first and in the last clause that compares two objects."""
     item = plan.definition.object
     steps = [[(item(c.subject), item(c.object)) for c in step.condition.clauses if c.object] for step in plan.steps]
     return [[pairs[0], pairs[-1]] if pairs else [] for pairs in steps]
@@ -132,8 +132,9 @@ class FocusFeatures(_RelativePositions):
     policy can transfer its behavior between tasks.
 
     Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes
-    ``features`` (B, 18): for the first and the last clause with two objects, the position of the second object relative
-    to the first, in units of 10 cm, and squashed by tanh at 2 cm and at 10 cm; 0 for a plan step without such clauses.
+    ``features`` (B, 18). For each of two clauses, the first and the last with two objects, these are 9 numbers: the
+    position of the second object relative to the first, in units of 10 cm and squashed by tanh at 2 cm and at 10 cm. A
+    plan step without such clauses has zeros.
 
     Args:
         plans: the plans whose conditions name the objects.
@@ -160,13 +161,15 @@ class RoleFeatures(_RelativePositions):
     transfer it between tasks. The direction of "push the dial to the right" is to the right; that of "push it toward
     the target location" is from the object to the goal. Offsets longer than 25 cm are shortened to 25 cm.
 
-    If the gripper touches an object away from the object's position, the target is the *contact*, which :meth:`fit`
-    computes from demonstrations of the task. In a task without demonstrations, the target is the point that the plan
-    names, and a carried object is first lifted to 15 cm above the target, then lowered.
+    The point at which demonstrations touch an object, its *contact*, can differ from the observed position of the
+    object. :meth:`fit` computes the contacts from demonstrations, and the features use them as targets. In a task
+    without demonstrations, the target is the point that the plan names, and a carried object is first lifted to 15 cm
+    above the target, then lowered.
 
     Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64, and the outputs
-    of :class:`RandomYaw` and :class:`JitterTarget` if present; writes ``features`` (B, 12): the relative position, in
-    units of 10 cm and squashed by tanh at 2 cm and 10 cm, and the direction, a unit vector (0 if the step has none).
+    of :class:`RandomYaw` and :class:`JitterTarget` if present; writes ``features`` (B, 12). These are the relative
+    position, in units of 10 cm and squashed by tanh at 2 cm and 10 cm (9 numbers), and the direction, a unit vector, or
+    zeros for a step without a direction.
 
     Args:
         plans: plans whose steps have roles, see :func:`~lw_torchrl.canonical_plans`.
@@ -174,7 +177,8 @@ class RoleFeatures(_RelativePositions):
         in_keys, out_keys: replacements for the default input and output keys; nested keys are allowed.
 
     Attributes:
-        contact: (T, 3) float32 in metres, each task's hand position minus first-object position while the hand acts.
+        contact: (T, 3) float32 in metres, for each task the hand's position relative to the first object while the hand
+            acts on the object.
         demonstrated: (T,) bool, whether a task has demonstrations.
         fitted: () bool, whether :meth:`fit` was called.
 
@@ -242,7 +246,8 @@ class RoleFeatures(_RelativePositions):
         self._sharing = WeakSet([self])
 
     def with_plans(self, plans: AnyPlans) -> RoleFeatures:
-        """Return features for different plans, which share the contacts of common tasks, also after a later fit."""
+        """Return features for different plans. For common tasks, both always have the same contacts, even if one of
+        them is fitted later."""
         other: RoleFeatures = super().with_plans(plans)
         other._sharing = self._sharing
         other._sharing.add(other)
@@ -270,7 +275,6 @@ class RoleFeatures(_RelativePositions):
         """
         observation, task_id = read(rows, [self.in_keys[0], self.in_keys[2]])
         observation, task_id = observation.reshape(-1, self.layout.size), task_id.reshape(-1)
-        check_rows(observation)
         program = plan_program(self.plans)
         latches = rows.get("qaf_latches", None) if program.num_latches else None
         truth = program(observation, task_id, None if latches is None else latches.reshape(len(observation), -1))
@@ -320,7 +324,7 @@ class RoleFeatures(_RelativePositions):
         if (offset := tensordict.get("target_offset", None)) is not None:
             position = position + offset.unsqueeze(-2)
         position = position.flatten(-2)
-        if (tilt := tensordict.get(tilt_key(self.in_keys[0]), None)) is not None:
+        if (tilt := tensordict.get(key_beside(self.in_keys[0], "_tilt"), None)) is not None:
             position = (tilt @ position.unsqueeze(-1)).squeeze(-1)
         position = position * (_FAR / position.norm(dim=-1, keepdim=True).clamp(min=_FAR))
         return torch.cat((position / _SCALE, *squash(position), self.directions(*inputs)), -1)
@@ -336,7 +340,7 @@ def _moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
 
 
 def _ahead(plan: ConditionalPlan) -> list[list[Pair]]:
-    """Return for each plan step toward the goal, or toward an object, the pair of the first object and this target."""
+    """Return the first object and the target of each plan step with a direction toward the goal or an object."""
     task = plan.definition
     x, y, z = places(task.layout.positions[1])
     first = NamedObject("first object", (x, y, z))

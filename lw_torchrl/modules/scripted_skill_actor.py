@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from lw_torchrl._util.checks import shown, typed
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.keys import Keys, dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
@@ -22,8 +22,10 @@ from lw_torchrl.modules.parts import Part, in_mode_of
 
 
 class ScriptedSkillActor(Part):
-    """A policy that executes plans with scripted skills: the skill of a step whose condition is true acts;
-    if no condition is true, the last step's skill acts.
+    """A policy that executes plans with scripted skills.
+
+    At each time step, the skill of a plan step whose condition is true acts. If no condition is true, the last step's
+    skill acts.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
     truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, whose rows sum to 1. Soft
@@ -65,8 +67,6 @@ class ScriptedSkillActor(Part):
         super().__init__(("observation", "task_id", "qaf"), ("action", "skill_weights"), in_keys, out_keys)
         self.plans = as_plans(plans)
         self.tasks, self.layout = tuple(self.plans), self.plans.layout
-        if not -(2**63) <= seed < 2**64:
-            raise ValueError(f"seed must be from -2**63 to 2**64 - 1, got {shown(seed)}")
         self.select, self.seed, self.draws = select, seed, select == "random"
         self._skills = None if skills is None else dict(skills)
         texts: Any = {plan.definition: [step.skill for step in plan.steps] for plan in self.plans.values()}
@@ -77,9 +77,9 @@ class ScriptedSkillActor(Part):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The keyword arguments that reconstruct this module; a :class:`TypeError` is raised for custom skills."""
+        """The keyword arguments that reconstruct this module. Raises a :class:`TypeError` for custom skills."""
         if self._skills is not None:
-            raise TypeError("a ScriptedSkillActor with custom skills cannot be saved; save the file of the skills")
+            raise TypeError("a ScriptedSkillActor with custom skills cannot be saved; save the skills file instead")
         return super().config
 
     @property

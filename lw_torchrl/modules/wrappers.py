@@ -48,7 +48,7 @@ class _ActionWrapper(_Wrapper):
 
     def converted(self, action: Tensor) -> Tensor:
         """Convert the wrapped actor's actions (..., A) to this policy's actions."""
-        raise NotImplementedError(f"{type(self).__name__} must override converted")
+        raise NotImplementedError(f"{type(self).__name__} must override converted()")
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -160,7 +160,7 @@ def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -
 class DemonstratedActor(_Wrapper):
     """A policy that uses an actor without plans for demonstrated tasks, and an actor with plans for all other tasks.
 
-    Plans do not help in tasks that ten demonstrations already cover.
+    Demonstrated tasks need no plan: with ten demonstrations, a plan does not increase the success rate.
 
     Reads the input keys of both actors; writes ``action`` (B, A) float32 and the other keys that ``others`` writes.
 
@@ -224,9 +224,9 @@ class DemonstratedActor(_Wrapper):
 class TransferredActor(_ActionWrapper):
     """A wrapper that runs an actor on another suite's plans, and converts the actions to that suite's layout.
 
-    A full displacement stays a full displacement, so the hand moves as fast as the new robot can; with ``speed``, it
-    moves by that multiple of its metres per time step in the training suite. A ``binary_gripper`` closes at an effort
-    above ``closes_above``.
+    By default, displacements in [-1, 1] stay the same, so the largest displacement moves the hand as fast as the new
+    robot can. With ``speed``, the hand moves ``speed`` times as many metres per time step as in the training suite. A
+    binary gripper closes at an effort above the new layout's ``closes_above``.
 
     Reads the actor's input keys, in the other layout; writes ``action`` (B, A) float32 in [-1, 1] and the actor's other
     output keys.
@@ -234,7 +234,7 @@ class TransferredActor(_ActionWrapper):
     Args:
         actor: an actor whose features have the same meaning in both layouts: :class:`RoleFeatures` and "opening".
         plans: plans for the other suite's tasks.
-        speed: scale factor of the metres per time step; None keeps a full displacement full.
+        speed: the hand's metres per time step, relative to the training suite; None to keep displacements the same.
         trained: the layout with which the actor was trained; None for the actor's layout.
 
     Raises:

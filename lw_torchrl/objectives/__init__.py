@@ -1,4 +1,4 @@
-"""Losses that TorchRL lacks: expectile regression, advantage-weighted imitation, TD3 and SAC with demonstrations."""
+"""Losses that TorchRL lacks: expectile regression, weighted imitation, and TD3 and SAC with demonstrations."""
 
 import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.objectives.demonstrated import DemonstratedSACLoss, DemonstratedTD3Loss

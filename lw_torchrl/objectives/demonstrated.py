@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss, TD3BCLoss
 
 from lw_torchrl._util.checks import Scale, typed
+from lw_torchrl._util.keys import read
 from lw_torchrl.objectives.offline import Reduction
 
 if TYPE_CHECKING:
@@ -54,16 +55,13 @@ class _ImitatesDemonstrations(_Loss):
         self._in_keys.append(self.tensor_keys.is_demonstration)
 
     def _imitation(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        """Return the squared distance of actions (B, A) to demonstrated actions, (B,) float32, 0 in other rows.
+        """Return the squared distance (B,) float32 between actions (B, A) and the demonstrated actions.
 
-        The distance is scaled so that its mean over all rows is the mean over demonstrations.
+        The distance is 0 in rows without a demonstration. The others are scaled so that the mean over all rows is the
+        mean over the demonstrations.
         """
         key = self.tensor_keys.is_demonstration
-        if (is_demonstration := tensordict.get(key, None)) is None:
-            raise ValueError(
-                f"the batch lacks {key!r}, (B,) bool, which marks the rows to imitate: load_demonstrations "
-                "writes this key; add it to other rows, or choose another key with set_keys"
-            )
+        (is_demonstration,) = read(tensordict, [key])
         if is_demonstration.dtype != torch.bool:
             raise ValueError(f"{key!r} must be torch.bool, true for demonstrations, got {is_demonstration.dtype}")
         rows = is_demonstration.reshape(action.shape[:-1])
@@ -103,7 +101,7 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
         True
 
     Source: Fujimoto and Gu, 'A Minimalist Approach to Offline Reinforcement Learning' (TD3+BC); Ball et al., 'Efficient
-    Online Reinforcement Learning with Offline Data', for batches of equally many demonstrations and collected rows.
+    Online Reinforcement Learning with Offline Data', for batches that are half demonstrations, half collected rows.
     """
 
     @dataclass

@@ -27,7 +27,8 @@ class ExpectileValueLoss(LossModule):
 
     The loss of a row is |τ - 1(u < 0)|·u², where u is the target minus V. The target is the reward plus the discounted
     value of the next state by the target network (n time steps ahead if the rows have ``steps_to_next_obs``). With an
-    expectile above one half, V follows the better rows. :class:`AdvantageWeightedLoss` weights rows by u.
+    expectile above 0.5, V approaches the value of the better actions. :class:`AdvantageWeightedLoss` uses u as the
+    advantage.
 
     Reads the network's input keys, also in ``next``; ``("next", "reward")`` (B, 1) float32; ``("next", "done")`` and
     ``("next", "terminated")`` (B, 1) bool; and, if present, ``steps_to_next_obs`` (B,) int64 and ``priority_weight``
@@ -251,7 +252,8 @@ class AdvantageWeightedLoss(LossModule):
             raise ValueError(f"advantage must be {(*tensordict.batch_size, 1)} in {action.dtype}, got {got}")
         check_finite("advantage", advantage)
         logs, most = self.beta * advantage.detach().squeeze(-1), math.log(self.max_weight)
-        # A weighted mean depends only on ratios of weights. Divided by the largest, they cannot all underflow.
+        # A weighted mean depends only on the ratios of the weights. After division by the largest weight, they cannot
+        # all underflow.
         largest = logs.max().clamp(max=most) if self.reduction == "mean" else 0.0
         weights = (logs.clamp(max=most) - largest).exp()
         loss = self._reduce_loss(self._distance(tensordict, action), tensordict, weights=weights)
@@ -310,10 +312,11 @@ def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
 
 @typed
 def with_n_steps(loss: LossModule, batch: TensorDictBase) -> TensorDictBase:
-    """Prepare a batch of n-step rows and a loss's value estimator: ``loss(with_n_steps(loss, batch))``.
+    """Prepare a batch of n-step rows, and a loss's value estimator, for ``loss(with_n_steps(loss, batch))``.
 
-    TorchRL's :class:`~torchrl.objectives.IQLLoss` and :class:`~torchrl.objectives.REDQLoss` only pass ``next`` to the
-    estimator, so this function copies ``steps_to_next_obs`` into ``next``. Other losses and rows stay unchanged.
+    TorchRL's :class:`~torchrl.objectives.IQLLoss` and :class:`~torchrl.objectives.REDQLoss` pass only ``next`` to the
+    estimator, so this function copies ``steps_to_next_obs`` into ``next`` and sets the estimator's key. For any other
+    loss, or without ``steps_to_next_obs``, nothing changes.
 
     Args:
         loss: any loss whose ``make_value_estimator`` was called.

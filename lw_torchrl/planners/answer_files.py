@@ -15,9 +15,10 @@ from lw_torchrl._util.checks import Count, check_choice, check_value, counted, d
 from lw_torchrl._util.files import AnyPath, expanded, read_json, read_text, write_json, write_text
 from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
 from lw_torchrl.language.nearest import StepMapper
-from lw_torchrl.language.plan_decoding import DecodedPlan, decode_as, decode_plan, without_thoughts
+from lw_torchrl.language.plan_decoding import DecodedPlan, decode_as, decode_plan
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import Task, TaskList, named_tasks
+from lw_torchrl.language.thoughts import without_thoughts
 from lw_torchrl.planners.prompts import passes, read_structured
 
 CUT_OFF = "the answer was cut off at max_tokens"
@@ -65,7 +66,7 @@ class Reply:
 
     @property
     def is_answer(self) -> bool:
-        """Whether the model answered, if only by a refusal. Other replies, such as mere thoughts, are not cached."""
+        """Whether the model answered or refused. Other replies, such as reasoning without an answer, are not cached."""
         return bool(re.search(r"\w", without_thoughts(self.text, [])) or self.refusal.strip())
 
 
@@ -161,7 +162,7 @@ def write_settings(folder: Path, settings: dict[str, Any]) -> None:
     if before != settings:
         difference = ", ".join(differences(before, settings))
         advice = "use the earlier settings, or choose a new name (--name) or out folder for the new answers"
-        raise ValueError(f"out: {str(folder)!r} holds answers with different settings ({difference}); {advice}")
+        raise ValueError(f"out: {str(folder)!r} contains answers with different settings ({difference}); {advice}")
     write_json(file, settings)
 
 

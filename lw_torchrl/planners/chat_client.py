@@ -59,7 +59,7 @@ def server_address(base_url: str | None) -> str:
 
 
 def _is_local(address: str) -> bool:
-    """Return whether an address is of this machine, which is reached without a proxy."""
+    """Return whether an address is on this machine, in which case no proxy is used."""
     host = urlsplit(address).hostname or ""
     with suppress(ValueError):
         return ipaddress.ip_address(host).is_loopback
@@ -89,7 +89,8 @@ class ChatClient:
         self._is_local = _is_local(self.address)
         try:
             own = {"trust_env": False, "verify": ssl.create_default_context()} if self._is_local else {}
-            options |= {"http_client": _limited(openai, timeout)(**options, **own), "max_retries": retries}
+            limited = _limited(openai, timeout, refusals=0 if self._is_local else 1)
+            options |= {"http_client": limited(**options, **own), "max_retries": retries}
             self._client = openai.OpenAI(api_key=key or "none", base_url=base_url, **options)
         except Exception as error:  # httpx and ssl raise many kinds of errors for invalid environment variables
             advice = f"check the environment variables of proxies and certificates{self._environment()}"
@@ -133,7 +134,7 @@ class ChatClient:
 
     def _explain(self, error: Any) -> tuple[str, bool]:
         """Return a description of a client's error (the cause and a remedy), and whether the error is fatal."""
-        tried = f"tried {counted(int(error.request.headers.get('x-stainless-retry-count', 0)) + 1, 'time')}"
+        tried = f"asked {counted(int(error.request.headers.get('x-stainless-retry-count', 0)) + 1, 'time')}"
         status, message = getattr(error, "status_code", None), _excerpt(self._without_key(_error_text(error)))
         fatal = True
         if any(isinstance(cause, self._openai.APITimeoutError) for cause in (error, error.__cause__)):
@@ -176,23 +177,30 @@ class ChatClient:
         return f" (set in the environment: {', '.join(names)}{ignored})" if names else ""
 
     def _without_key(self, text: Any) -> Any:
-        """Redact the API key in a text or in bytes. A key of under 8 characters may be an ordinary word, so is kept."""
+        """Redact the API key in a text or in bytes. Keep a key of under 8 characters, which may be a common word."""
         key, hidden = self._key, "(the key)"
         if len(key) < 8:
             return text
         return text.replace(key, hidden) if isinstance(text, str) else text.replace(key.encode(), hidden.encode())
 
 
-def _limited(openai: Any, timeout: float) -> Any:
+def _limited(openai: Any, timeout: float, refusals: int) -> Any:
     """Return a subclass of the ``openai`` package's HTTP client that limits the time and the size of each reply.
 
-    The client's own timeout limits only each read, so a server that sends a byte now and then would never time out.
+    The timeout of ``openai`` applies to each read, so a server that sends a byte now and then would never time out.
+    A refused connection is retried at most ``refusals`` times, because a server that is not running seldom starts then.
     """
 
     class LimitedClient(openai.DefaultHttpxClient):
         def send(self, request: Any, **options: Any) -> Any:
             end = monotonic() + timeout
-            response = super().send(request, **{**options, "stream": True})
+            try:
+                response = super().send(request, **{**options, "stream": True})
+            except Exception as error:
+                is_last = int(request.headers.get("x-stainless-retry-count", 0)) >= refusals
+                if is_last and "refused" in str(error).lower():
+                    raise openai.APIConnectionError(request=request) from error  # openai does not retry this error
+                raise
             content = bytearray()
             with closing(response):
                 for part in response.iter_bytes():
@@ -234,7 +242,7 @@ def _status(status: int, content: bytes) -> int:
 
 
 def _reported_error(body: Any) -> Any:
-    """Return the error that a reply's body reports, which is a text or a JSON value; None without an error."""
+    """Return the error that a reply's body reports (a string or a JSON value), or None if it reports no error."""
     if not isinstance(body, dict):
         return None
     choices = body.get("choices")
@@ -247,7 +255,7 @@ def _reported_error(body: Any) -> Any:
 
 
 def _wait_text(headers: Mapping[str, str]) -> str:
-    """Report for how long the server asks to wait, as an HTTP header states it; "" without such a header."""
+    """Return a clause with the waiting time from the reply's "retry-after" header; "" without such a header."""
     for name, scale in (("retry-after-ms", 0.001), ("retry-after", 1.0)):
         text = _excerpt(headers.get(name, ""))[:100]
         try:
@@ -290,7 +298,7 @@ def _read_completion(content: bytes) -> tuple[Reply, str]:
     """
     if len(content) > REPLY_LIMIT:
         size = f"the reply is larger than {REPLY_LIMIT // 2**20} MiB"
-        raise PlannerError(f"{size}. Use fewer max_tokens, and remove options that lengthen replies")
+        raise PlannerError(f"{size}. Lower max_tokens, and remove options that lengthen replies")
     try:
         body = json.loads(content.decode("utf-8-sig"))
         choices = [choice for choice in body["choices"] or () if choice is not None]
@@ -329,8 +337,7 @@ def _no_completion(content: bytes) -> PlannerError:
 
 
 def _join_parts(content: Any) -> tuple[str, str]:
-    """Return the answer and the refusal in a message's content, which is a text or a list of parts; thoughts are
-    omitted."""
+    """Return the answer and the refusal in a message's content (a text or a list of parts), without reasoning."""
     answer, refusal = [], []
     for part in content if isinstance(content, list) else [content]:
         if isinstance(part, dict) and part.get("type", "text") in ("text", "output_text", "refusal"):

@@ -176,8 +176,8 @@ class OpenAIPlanner:
         Args:
             answers: the answers to revise, all in one format.
             facts: a report on each answer, as written by :func:`~lw_torchrl.planners.repairing.plan_facts`.
-            round: the number of the round, from 1.
-            tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
+            round: the number of the round, starting at 1.
+            tasks: the known tasks by name, as returned by :func:`~lw_torchrl.load_tasks`.
             out: as for :meth:`plans`, but with ``-round<round>`` appended to the folder's name.
             progress: show a progress bar.
         """
@@ -226,7 +226,7 @@ class OpenAIPlanner:
                 bar.update()
         if errors:
             others = f" {counted(len(errors) - 1, 'other request')} also failed." if len(errors) > 1 else ""
-            kept = f"{len(answers)} of {counted(len(questions), 'answer')} are kept in {str(self.cache)!r}"
+            kept = f"{len(answers)} of {counted(len(questions), 'answer')} are cached in {str(self.cache)!r}"
             message = f"{errors[0]}{others} {kept}; repeat the call to request the missing answers."
             raise PlannerError(message, fatal=errors[0].fatal)
         return Answers(answers)

@@ -1,4 +1,4 @@
-"""Prompts for plans, plans as JSON, and the JSON Schema that constrains a model to plans for one task."""
+"""Prompts that request plans, plans in JSON, and the JSON Schema that constrains a model to plans for one task."""
 
 from __future__ import annotations
 
@@ -211,9 +211,9 @@ def plan_schema(
 ) -> dict[str, Any]:
     """Build the JSON Schema for a task's plans, in the form that :func:`write_structured` writes.
 
-    The schema uses only features that the strict modes of OpenAI, vLLM, Ollama, llama.cpp and llama-cpp-python share. A
-    clause is three small choices rather than one among hundreds: OpenAI allows 1,000 enum values in total; the largest
-    task has 320.
+    The schema uses only features that the strict modes of OpenAI, vLLM, Ollama, llama.cpp and llama-cpp-python share.
+    OpenAI allows 1,000 enum values in total. Therefore a clause has three fields with few values each, instead of one
+    field with hundreds of values. The schema of the largest task has 320 values.
 
     Args:
         format: the format, whose style determines whether each step has a reason and a goal.
@@ -256,7 +256,7 @@ def passes(value: Any, schema: Mapping[str, Any]) -> bool:
 
 
 def _clauses(task: Task) -> list[dict[str, Any]]:
-    """Build schemas for clauses that allow, for each subject and predicate, only objects that complete a base query."""
+    """Build schemas for clauses, in which each subject and predicate allow only the objects of supported queries."""
     seconds = defaultdict[tuple[str, str], list[str | None]](list)
     for clause in base_clauses(task, tuple(PREDICATES)):
         predicate = f"not {clause.predicate}" if clause.negated else clause.predicate
@@ -282,5 +282,5 @@ def _list(items: dict[str, Any], most: int) -> dict[str, Any]:
 
 
 def _object(properties: dict[str, Any]) -> dict[str, Any]:
-    """Build the schema of an object with exactly these properties."""
+    """Build the JSON schema of an object that requires these properties and allows no others."""
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}

@@ -1,4 +1,4 @@
-"""Checks of plans in the simulator, and repair: reporting failures to the model that wrote a plan."""
+"""Check plans in the simulator, and repair them by reporting failures to the model that wrote them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -48,7 +48,7 @@ class PlanCheck:
         lines = [f"{self.task}, {len(self.decoded.plan.steps)} steps"]
         for k, step in enumerate(step for step in self.decoded.steps if not step.dropped):
             use = self.own
-            own = "" if use is None else f" and {use.true[k]:.0%} of the plan's, acts in {use.chosen[k]:.0%} of these"
+            own = "" if use is None else f" and {use.true[k]:.0%} of the plan's (chosen in {use.chosen[k]:.0%})"
             lines += [
                 f"{k + 1}  when {step.condition}{_written(step.written_condition, step.condition_distance)}",
                 f"   {step.scripted or 'no scripted skill'}{_written(step.written_skill, step.skill_distance)}",
@@ -68,7 +68,7 @@ class PlanCheck:
 
 
 def _written(text: str, distance: float) -> str:
-    """Show the original text and the distance of a replacement; "" for an exact match."""
+    """Return a remark with the replaced text and its distance; "" if the text was not replaced."""
     return f"   <- {text!r} ({distance:.2f})" if distance else ""
 
 
@@ -133,7 +133,9 @@ class Repair:
 
 
 def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
-    """Write a report for the model on how its plan performed; of ``notes``, only truncation is reported.
+    """Write a report for the model on how its plan performed.
+
+    If ``notes`` state that the answer was cut off, the report repeats this. Other notes are ignored.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS

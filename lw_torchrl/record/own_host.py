@@ -1,7 +1,8 @@
 """Forward requests to a server on this machine, if their Host header names this machine.
 
-A web page from elsewhere can let its own host name resolve to 127.0.0.1 (DNS rebinding). Its scripts may then read all
-answers of a server on this machine, unless the server rejects that host name, which Rerun's servers do not.
+A foreign web page can make its own host name resolve to 127.0.0.1 (DNS rebinding). Its scripts can then read all
+replies of a server on this machine, unless the server rejects foreign host names. Rerun's servers do not reject
+them.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _LONGEST, _MOST = 16_384, 100  # maximum length and number of the header lines
 
 
 def hidden_address() -> str:
-    """Return an address of this machine that no web page can guess, if the system has several such addresses."""
+    """Return a random loopback address, which no web page can guess. On systems other than Linux, return 127.0.0.1."""
     return f"127.{randbelow(256)}.{randbelow(256)}.{1 + randbelow(254)}" if sys.platform == "linux" else LOCAL
 
 

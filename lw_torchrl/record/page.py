@@ -1,4 +1,4 @@
-"""The page of a recorded episode: the logged data and the views, shown in a tab of their own or side by side."""
+"""The page of a recorded episode: its logged data and views, shown in a tab or next to another episode."""
 
 from __future__ import annotations
 
@@ -45,7 +45,6 @@ CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
     "action": ("Action", (-1.2, 1.2)),
     "reward": ("Reward", None),
     "skill_weights": ("Skill weights", (-0.1, 1.1)),
-    "corrected": ("Weight of the correction", (-0.1, 1.1)),
 }
 """A mapping from curves to their titles and value ranges (None: no fixed range)."""
 

@@ -26,14 +26,14 @@ NO_STEP = -1  # used instead of a plan step's index if no single step is active
 
 @runtime_checkable
 class PlanLike(Protocol):
-    """An object with ``steps``, each with a ``condition`` (shown with ``str``) and a ``skill`` (a string)."""
+    """An object with ``steps``; each step has a ``condition`` (shown with ``str``) and a ``skill`` (a string)."""
 
     @property
     def steps(self) -> Sequence[Any]: ...
 
 
 class TargetPose(NamedTuple):
-    """Positions (T×3, metres) of a skill's target and moved object, equal on axes that the skill does not control."""
+    """Positions (T×3, metres) of a skill's target and moved object, which are equal on uncontrolled axes."""
 
     position: NDArray[np.float32]
     moved: NDArray[np.float32]
@@ -59,7 +59,6 @@ class RecordedEpisode:
     skill_weights: NDArray[np.float32] | None = None  # T×S, attention over the plan steps
     success: NDArray[np.bool_] | None = None  # T, success in the state after the row's action
     reward: NDArray[np.float32] | None = None  # T, reward of the row's action
-    corrected: NDArray[np.float32] | None = None  # T, the weight of a learned correction to the action
     steps: tuple[tuple[str, str], ...] = ()  # S (condition, skill) texts; empty without a plan
     guards: tuple[Any, ...] = ()  # S conditions: queries, or the objects of another plan
     reasons: tuple[str, ...] = ()  # S texts: a plan step's comment, or the skill as originally written
@@ -97,8 +96,10 @@ class RecordedEpisode:
 
     @cached_property
     def active(self) -> NDArray[np.int64] | None:
-        """The index (T,) of the active plan step: the step with the largest weight (without weights, the first step
-        whose condition holds), or -1 if there is none."""
+        """The index (T,) of the active plan step, or -1 if there is none.
+
+        The active step is the one with the largest weight or, without weights, the first whose condition holds.
+        """
         if self.skill_weights is not None:
             weights = self.skill_weights
             if weights.shape[1] == 1:
@@ -198,7 +199,6 @@ class RecordedEpisode:
             skill_weights=optional("skill_weights"),
             success=optional(("next", "success"), flat=True, truth=True),
             reward=optional(("next", "reward"), flat=True),
-            corrected=optional("action_corrected", flat=True),
             steps=steps,
             guards=() if plan is None else tuple(step.condition for step in plan.steps),
             reasons=() if plan is None else tuple(map(_reason, plan.steps)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import io
 import os
 import threading
 import time
@@ -25,14 +24,11 @@ from torchrl.record.loggers import Logger
 from lw_torchrl._util.checks import Positive, check_choice, typed
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.text import markdown
-from lw_torchrl.evaluation.figures import plot_failures
-from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.record.entities import (
     METRIC_TIMELINE,
     STEP_TIME,
-    check_image,
     entity_path,
     rr,
     send_images,
@@ -54,7 +50,7 @@ FLUSH_SECONDS = 5.0
 
 
 class RerunLogger(Logger):
-    """A TorchRL logger that writes one Rerun recording: metrics, images, videos, and whole episodes in 3-D.
+    """A TorchRL logger that writes one Rerun recording: metrics, videos, and whole episodes in 3-D.
 
     Rerun writes the file in a background thread while the program runs, so a killed program leaves a recording that
     :func:`open_viewer` can open. A full disk or a lost viewer never stops the program: Rerun prints an error, and the
@@ -104,7 +100,7 @@ class RerunLogger(Logger):
         super().__init__(exp_name=name, log_dir=str(self.path.parent) if self.path else os.curdir)
 
     def _create_experiment(self) -> rr.RecordingStream:
-        # The Rerun viewer gives all recordings of an application the same layout, so each recording is an application.
+        # The Rerun viewer shows recordings with the same application id in the same layout, so each gets its own id.
         stream = rr.RecordingStream(f"{self.exp_name}-{uuid.uuid4().hex[:8]}", recording_id=uuid.uuid4())
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
@@ -155,31 +151,16 @@ class RerunLogger(Logger):
             values.append(row)
             self._send(now=len(values) >= BUFFERED_SCALARS)
 
-    def log_image(self, name: str, image: Any, step: int | None = None) -> None:
-        """Add an image "images/<name>", encoded as JPEG, on the timeline "global_step".
-
-        The image has the shape H×W, H×W×C or C×H×W (C = 1 or 3) and is uint8 or float in [0, 1]. For ``step``, see
-        :meth:`log_scalar`.
-        """
-        stream, pixels = self._open(), check_image(name, image)
-        with self._lock:
-            send_images(stream, *self._place("images", name, step), [pixels])
-            self._send()
-
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
         """Add a video "videos/<name>" as JPEG images, with frame i at time step i of the episodes' timelines.
 
         Args:
-            video: a video T×C×H×W uint8 (C = 1 or 3), or N videos N×T×C×H×W, stored as "videos/<name>/0" etc.
+            video: a video T×C×H×W or 1×T×C×H×W uint8 (C = 1 or 3).
             step: the training step, which becomes part of the path: "videos/<name>/step 1000".
             **kwargs: ``fps``, frames per second (default: 80, as in Meta-World); other arguments are ignored.
         """
         video = torch.as_tensor(video).detach().cpu()
-        if video.ndim == 5 and len(video) != 1:
-            for i, clip in enumerate(video):
-                self.log_video(f"{name}/{i}", clip, step, **kwargs)
-            return
-        video = video[0] if video.ndim == 5 else video
+        video = video[0] if video.ndim == 5 and len(video) == 1 else video
         if video.ndim != 4 or video.shape[1] not in (1, 3) or not video.numel() or video.dtype != torch.uint8:
             actual = f"{video.dtype} of shape {tuple(video.shape)}"
             raise ValueError(f"video {name!r} must be uint8 of shape T×C×H×W (C = 1 or 3), got {actual}")
@@ -244,7 +225,7 @@ class RerunLogger(Logger):
         self.flush(timeout)
         self._service_shutdown = True
         atexit.unregister(self.shutdown)
-        # With a full disk, Rerun may wait forever for its writing thread, which has ended, here and at exit.
+        # If the disk is full, Rerun's writer thread has ended, and Rerun may wait for it forever, here and at exit.
         closing = threading.Thread(target=self.experiment.disconnect, daemon=True)
         closing.start()
         wait = FLUSH_SECONDS if timeout is None else timeout
@@ -253,21 +234,6 @@ class RerunLogger(Logger):
             rr.unregister_shutdown()
         if self.path is not None and not is_complete(self.path):
             warnings.warn(f"recording {str(self.path)!r} is incomplete: the end could not be written", stacklevel=2)
-
-    def is_written(self) -> bool:
-        """Return whether the closed file can be read and holds all pages; after a full disk, it does not."""
-        from rerun.chunk import RrdReader
-
-        if self.path is None or not is_complete(self.path):  # Rerun would wait for the rest of the file
-            return False
-        try:
-            reader = RrdReader(self.path)
-            for _ in reader.stream():  # a block that could not be written has a wrong checksum
-                pass
-            tabs = Tabs.read(reader)
-        except RuntimeError:
-            return False
-        return (0 if tabs is None else tabs.count) == self._tabs.count
 
     def _checkpoint_state(self) -> dict[str, Any]:
         return {"counters": dict(self._counters)}
@@ -328,7 +294,7 @@ class RerunLogger(Logger):
             rollout: one episode of batch size (T,). Without a layout, all keys are optional: "action" T×A, ("next",
                 "success") T×1, ("next", "reward") T×1 float32, "pixels" T×H×W×C or T×C×H×W. With a layout,
                 "observation" T×D float32 (metres) and "action" are required. The other keys of
-                :func:`lw_torchrl.log_rollout` are also accepted. Columns beyond the plan's S steps are ignored padding.
+                :func:`lw_torchrl.log_rollout` are also accepted. Columns beyond the plan's S steps are padding.
             task: the task's name.
             objects: name -> T×3 positions in metres; "robot's gripper" is added if the layout is known.
             plan: an object whose ``steps`` each have a ``condition`` and a ``skill``; None shows numbered columns.
@@ -378,14 +344,6 @@ class RerunLogger(Logger):
             self._tabs.add("page", vars(page))
             self._send()
         return name
-
-    def show_causes(self, result: EvaluationResult) -> None:
-        """Add the figure of :func:`lw_torchrl.evaluation.plot_failures` for ``result`` to the overview tab."""
-        picture, path = io.BytesIO(), entity_path(OVERVIEW, "causes")
-        plot_failures(result).savefig(picture, format="png", dpi=100)
-        with self._lock:
-            self._open().log(path, rr.EncodedImage(contents=picture.getvalue(), media_type="image/png"), static=True)
-            self._tabs.add("figure", path)
 
     @typed
     def compare(self, names: Sequence[str], title: str = "Side by side") -> None:

@@ -21,8 +21,7 @@ from lw_torchrl.record.rollouts import read_rollout
 from lw_torchrl.transforms.environment import base_env, refuse_changed
 
 # The keys of a LanguageWorldEnv that are recorded before a time step, and after a time step.
-_BEFORE = {"task_id", "episode", "qaf_plan", "observation", "qaf", "qaf_logits", "skill_weights", "action_corrected"}
-_BEFORE |= {"pixels"}
+_BEFORE = {"task_id", "episode", "qaf_plan", "observation", "qaf", "qaf_logits", "skill_weights", "pixels"}
 _AFTER = {"executed_action", "success", "reward"}
 
 
@@ -98,7 +97,7 @@ class RolloutRecorder(Transform):
         if isinstance(env, LanguageWorldEnv):
             refuse_changed(self, "observation")
         elif {"task_id", "executed_action"} <= set(env.full_observation_spec.keys()):
-            raise TypeError(f"RolloutRecorder needs a LanguageWorldEnv in its own process, got {type(env).__name__}")
+            raise TypeError(f"RolloutRecorder cannot record episodes of another process, got {type(env).__name__}")
         count = max(1, env.batch_size.numel())
         for row in self.rows:
             if row >= count:
@@ -149,7 +148,7 @@ class _Row:
         if self._is_own:
             self._seed = self.env.seed
         if recorded and self._has_motion:
-            self._model = self.env.engine.model(self.row)
+            self._model = self.env.engine.row_model(self.row)
         self._add_pose()
 
     def add_step(self, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:

@@ -19,27 +19,25 @@ from lw_torchrl._util.checks import missing_keys, typed
 from lw_torchrl._util.devices import device_of
 from lw_torchrl._util.files import AnyPath, replacing
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.evaluation.diagnose.failure import Failure
-from lw_torchrl.evaluation.diagnose.replacements import own_evaluators
-from lw_torchrl.evaluation.diagnose.sentences import replacement_text
+from lw_torchrl.envs.rows import episode_seed
+from lw_torchrl.evaluation.diagnose.failure import Failure, replacement_text
 from lw_torchrl.evaluation.rollout import actor_plans, suite_tasks
 from lw_torchrl.evaluation.rollout import rollout as run_rollout
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
-from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluators_of
 from lw_torchrl.record.entities import STEP_TIME
 from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.recorded_episode import Ghost, RecordedEpisode
-from lw_torchrl.record.rerun_logger import RerunLogger
+from lw_torchrl.record.rerun_logger import RerunLogger, is_complete
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import Suite, known_suite, load_suite
 from lw_torchrl.transforms.qaf import QAFTransform, latches_of_rows
 
 _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
-_PLAN_KEYS = ("qaf", "qaf_logits", "skill_weights", "action_corrected")
+_PLAN_KEYS = ("qaf", "qaf_logits", "skill_weights")
 
 
 @typed
@@ -59,7 +57,7 @@ def log_rollout(
 
     If ``seed`` is given, the episode is re-simulated from the task, ``seed``, ``episode`` and actions to show the
     robot's motion. If the simulated observations are not bit-identical to the recorded ones, a warning is issued, and a
-    simple hand over a table is drawn instead of the robot, as when no ``seed`` is given.
+    simplified hand above a table is drawn instead of the robot, as when no ``seed`` is given.
 
     Args:
         logger: the logger of the recording.
@@ -67,11 +65,11 @@ def log_rollout(
             keys are "observation" T×39 float32 (metres), "task_id" T int64, "action" T×4 float32 in [-1, 1] (as
             executed) and ("next", "success") T×1 bool. Optional keys are ("next", "executed_action") T×4, which
             replaces the action, "episode" T int64, "qaf" T×S bool, "qaf_plan" T int64, "qaf_logits" T×S float32
-            (positive: true), "skill_weights" T×S float32, "action_corrected" T×1, ("next", "reward") T×1 float32 and
+            (positive: true), "skill_weights" T×S float32, ("next", "reward") T×1 float32 and
             "pixels" T×H×W×3 uint8 (the policy's input).
         plans: the plans whose conditions are evaluated in ``qaf``; None without plans.
         seed: the environment's seed, which determines the initial state together with ``episode``.
-        name: the episode's name in the recording, for batch size (T,); None for the task and episode ("push-7").
+        name: the episode's name in the recording, for batch size (T,); None to use the task and episode ("push-7").
         policy: the policy's name, shown in the tab.
         failure: the cause of the episode's failure, shown in the verdict; for N episodes, a list with one entry each.
         tasks: custom tasks that the plans do not define.
@@ -96,7 +94,7 @@ def log_rollout(
         rows = zip(rollout, failures, strict=True)
         return [log_rollout(logger, row, plans, failure=row_failure, **same) for row, row_failure in rows]
     if isinstance(failure, Sequence):
-        raise TypeError(f"failure must be a Failure of exactly one episode, got a list of {len(failure)}")
+        raise TypeError(f"failure must be a Failure for a rollout of one episode, got {len(failure)} entries")
     if suite is not None:
         suite = load_suite(suite)
         tasks = [*tasks, *suite.tasks.values()]
@@ -137,10 +135,10 @@ def read_rollout(
         plan = plans[label]
         plan_numbers = rollout.get("qaf_plan", None)
         if plan_numbers is not None and not bool((plan_numbers == Plans([plan]).numbers[label]).all()):
-            raise ValueError(f"plans must hold the plan from which rollout['qaf'] was computed; {label!r} has another")
+            raise ValueError(f"plans must hold the plan for {label!r} from which rollout['qaf'] was computed")
     if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
         failed = f"{failure.task} {failure.episode}"
-        raise ValueError(f"failure must be of the rollout's episode ({label} {index}), got {failed}")
+        raise ValueError(f"failure must describe the rollout's episode ({label} {index}), got {failed}")
     observation = rollout.get("observation", None)
     objects: dict[str, Tensor] = {}
     if task is not None and observation is not None and observation.shape[1:] == (task.layout.size,):
@@ -171,8 +169,8 @@ def simulate_again(
 ) -> Motion | None:
     """Re-simulate an episode from its executed actions (T, A) and return the motion (T + 1 rows).
 
-    Return None if the engine has no ``poses``. Raise a :class:`DiffersError` if the simulated observations (T, D) are
-    not bit-identical to the recorded ones; if they are, so is the motion.
+    Return None if the engine has no ``poses``. Raise a :class:`DiffersError` unless the simulated observations (T, D)
+    are bit-identical to the recorded ones.
     """
     suite = load_suite("metaworld") if suite is None else suite
     engine: Any = suite.make_engine([task], reward="sparse", num_threads=1)
@@ -180,7 +178,7 @@ def simulate_again(
         if not hasattr(engine, "poses"):
             return None
         simulated = engine.reset([0], [episode_seed(suite.tasks[task], seed, episode)])[0].astype(np.float32)
-        shape, active = (len(action) + 1, engine.model(0).model.nbody), np.ones(1, bool)
+        shape, active = (len(action) + 1, engine.row_model(0).model.nbody), np.ones(1, bool)
         positions, quaternions = np.empty((*shape, 3), np.float32), np.empty((*shape, 4), np.float32)
         touched = []
         for step in range(len(action) + 1):
@@ -192,7 +190,8 @@ def simulate_again(
                 error = np.abs(simulated.astype(np.float64) - observation[step])
                 raise DiffersError(f"step {step}: observation value {error.argmax()} differs by {error.max():.3g}")
             simulated = engine.step(action[step : step + 1], active).observation[0].astype(np.float32)
-        return Motion(engine.model(0), positions, quaternions, None if None in touched else tuple(map(str, touched)))
+        bodies = None if None in touched else tuple(map(str, touched))
+        return Motion(engine.row_model(0), positions, quaternions, bodies)
     finally:
         engine.close()
 
@@ -253,7 +252,7 @@ def run_recorded(
     own_plans = actor_plans(actor, plans)
     own_suite, chosen = suite_tasks(tasks, own_plans, suite)
     options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": own_suite, "engine": engine}
-    learned = [evaluator] if isinstance(evaluator, QueryEvaluator) else own_evaluators(actor)
+    learned = [evaluator] if isinstance(evaluator, QueryEvaluator) else evaluators_of(actor)
     has_answers = own_plans is not None and (evaluator is not None or bool(learned))
     finished: dict[tuple[str, int], FinishedEpisode] = {}
 
@@ -301,7 +300,7 @@ def new_recording(path: AnyPath) -> Iterator[RerunLogger]:
     with replacing(path) as file:
         with RerunLogger(file) as logger:
             yield logger
-        if not logger.is_written():
+        if not is_complete(file):
             message = "could not be written completely; check whether the disk is full"
             raise OSError(f"recording {os.fspath(path)!r} {message}")
 

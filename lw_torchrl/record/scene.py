@@ -66,9 +66,9 @@ def log_scene(
 ) -> tuple[list[str], dict[str, str]]:
     """Draw the robot, objects, goal, hand path and target pose below ``root``/scene, for a camera at ``eye``.
 
-    Return the entity paths of the trails, and the result of :func:`log_motion`. A trail has one short line per row in
-    ``drawn`` and is shown up to the time cursor. Without a motion, a hand over a table is drawn instead of the robot;
-    without a layout, no robot is drawn.
+    Return the entity paths of the trails, and the result of :func:`log_motion`. A trail consists of one short line per
+    row in ``drawn``; the lines up to the time cursor are visible. Without a motion, a hand over a table is drawn
+    instead of the robot; without a layout, no robot is drawn.
     """
     frames: dict[str, str] = {}
     scene, size = f"{root}/scene", scene_size(episode)
@@ -137,8 +137,7 @@ def log_scene(
 
 
 def touched_objects(motion: Motion, episode: RecordedEpisode) -> tuple[str, ...] | None:
-    """Return the name of the object that the fingers touched in each row: the object at the touched body's position, or
-    the body's name if there is no such object."""
+    """Return, for each row, the name of the object, or of another body, that the fingers touched."""
     if motion.touched is None:
         return None
     touched, model = np.array(motion.touched[: len(episode)]), motion.model.model
@@ -220,7 +219,7 @@ def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode, drawn: 
 
 
 def _log_target(stream: Any, scene: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> None:
-    """Draw an arrow, in the plan step's color, from the object that the active scripted skill moves to the target."""
+    """Draw an arrow, in the plan step's color, between the object that the active skill moves and its target."""
     if episode.active is None or not any(episode.target_poses):
         return
     start, end = np.zeros((2, len(episode), 3), np.float32)

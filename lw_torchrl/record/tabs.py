@@ -16,11 +16,11 @@ from lw_torchrl.record.page import Page
 
 OVERVIEW = "overview"
 """The name of the overview tab and of the overview's entity."""
-TITLES = {kind: kind.title() for kind in ("metrics", "histograms", "images", "videos")} | {"hparams": "Hyperparameters"}
+TITLES = {kind: kind.title() for kind in ("metrics", "histograms", "videos")} | {"hparams": "Hyperparameters"}
 """Titles of the tabs without episodes, by key. The keys are the first part of entity paths, so no episode may have such
 a name.
 """
-ON_METRIC_TIMELINE = {"metrics", "histograms", "images"}
+ON_METRIC_TIMELINE = {"metrics", "histograms"}
 _PROPERTY = "layout"
 
 
@@ -43,7 +43,6 @@ class Tabs:
     def __init__(self) -> None:
         self.pages: dict[str, Page] = {}
         self._compared: list[tuple[str, list[str]]] = []
-        self._figures: list[str] = []  # entities of the figures in the overview
         self._views: dict[str, list[str]] = {kind: [] for kind in TITLES}  # names of logged values
         self._entries: list[str] = []
         self._saved = self._sent = 0
@@ -55,15 +54,13 @@ class Tabs:
 
     def add(self, kind: str, content: Any) -> None:
         """Add content of one ``kind``: an episode's "page", a "compare" tab (a title and the names of the episodes to
-        compare), a "figure" in the overview, or a "view" of logged values.
+        compare), or a "view" of logged values.
         """
         self._entries.append(json.dumps([kind, content]))
         if kind == "page":
             self.pages[content["row"]["name"]] = Page(**content)
         elif kind == "compare":
             self._compared.append((content[0], content[1]))
-        elif kind == "figure":
-            self._figures.append(content)
         else:
             self._views[content[0]].append(content[1])
 
@@ -87,11 +84,6 @@ class Tabs:
             entry = rr.AnyValues(entry=self._entries[number])
             stream.log(f"__properties/{_PROPERTY}/{number}", entry, static=True)
         self._saved = len(self._entries)
-
-    @property
-    def count(self) -> int:
-        """The number of entries."""
-        return len(self._entries)
 
     @property
     def has_grown(self) -> bool:
@@ -143,9 +135,7 @@ class Tabs:
         return [first, *compared, *of_training, *of_episodes]
 
     def _overview_view(self) -> Any:
-        views: list[Any] = [rrb.TextDocumentView(origin=entity_path(OVERVIEW, "table"), name="Episodes")]
-        views += [rrb.Spatial2DView(origin=figure, name="Causes") for figure in self._figures]
-        return rrb.Horizontal(*views, column_shares=[1] * len(views), name=OVERVIEW.title())
+        return rrb.TextDocumentView(origin=entity_path(OVERVIEW, "table"), name=OVERVIEW.title())
 
     def _comparison(self, title: str, names: list[str], titles: dict[str, str]) -> Any:
         """Return a view with a column for each episode; all columns have the same axes."""
@@ -163,8 +153,9 @@ class Tabs:
         return tabs[self.index(name)]
 
     def opening_step(self, tab: str | None = None) -> int | None:
-        """Return the time step at which a tab opens: the earliest decisive step of the tab's episodes, or None if the
-        tab has no episodes.
+        """Return the time step at which a tab opens, or None if the tab has no episodes.
+
+        This is the earliest decisive step (:func:`~lw_torchrl.record.verdict.decisive_step`) of the tab's episodes.
         """
         return min((self.pages[name].decisive for name in self.tab(tab).episodes), default=None)
 
@@ -178,7 +169,7 @@ class Tabs:
         raise unknown_name("episode", str(name), [tab.name for tab in tabs])
 
     def _has_overview(self) -> bool:
-        """Return whether there is an overview tab: if there are several episodes, unless they form one comparison."""
+        """Return whether an overview tab is needed, because several episodes do not form a single comparison."""
         return len(self.pages) > 1 and len(self._compared) != 1
 
 

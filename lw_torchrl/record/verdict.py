@@ -9,16 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._util.text import markdown
-from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure
-from lw_torchrl.evaluation.diagnose.sentences import replaced_text
+from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure, replacement_text
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.outline import Line, outline
 from lw_torchrl.record.entities import FALSE, STEEL, Color, changes, rr, step_color
 from lw_torchrl.record.recorded_episode import NO_STEP, Ghost, RecordedEpisode
 
 AFTER_SUCCESS, AROUND_FAILURE = 8, 60
-"""The number of time steps to show after the first success, and before and after the time step at which a failure first
-shows."""
+"""The numbers of time steps to show after the first success, and on both sides of the first sign of a failure."""
 LONGEST = 200  # maximum number of time steps to show from the ghost's divergence to the failure
 LINE, MOST_LINES = 78, 2
 """The number of characters per line in a 1100×700 window, and the maximum number of lines for a condition."""
@@ -104,8 +102,11 @@ def shown_steps(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None 
 
 
 def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None) -> NDArray[np.int64]:
-    """Return the time steps at which the scene is drawn: every step (or every second step) of the shown range, every
-    8th step elsewhere, the decisive step and the last step."""
+    """Return the time steps at which the scene is drawn.
+
+    These are every step of the shown range (every second step if the range is long), every 8th step elsewhere, the
+    decisive step and the last step.
+    """
     first, last = shown_steps(heading, episode, ghost)
     steps, stride = np.arange(len(episode)), 1 if last - first <= AROUND_FAILURE else 2
     drawn = (steps >= first) & (steps <= last) & (steps % stride == 0) | (steps % SPARSE == 0)
@@ -142,7 +143,7 @@ def _reasons(failure: Failure, episode: RecordedEpisode) -> list[str]:
     seen = f"Seen at {episode.at(failure.at)} of {len(episode)}"
     if failure.step is not None and failure.step < len(episode.steps):
         seen += f", in {_step(episode, failure.step)}"
-    useless = [replaced_text(part) for part, succeeded in failure.counterfactuals.items() if not succeeded]
+    useless = [replacement_text(name, "removed") for name, helped in failure.counterfactuals.items() if not helped]
     useless_text = f" Replacing {' or '.join(useless)} did not help." if useless else ""
     return [*lines, f"{seen}.{useless_text}"]
 
@@ -231,7 +232,7 @@ def _plan_lines(episode: RecordedEpisode) -> list[tuple[Line, str]]:
 
 
 def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
-    """Log the curves ``root``/action, /distance (cm), /reward, /skill_weights and /corrected; return the names of the
+    """Log the curves ``root``/action, /distance (cm), /reward and /skill_weights; return the names of the
     logged curves."""
     rows, logged = np.arange(len(episode)), []
 
@@ -260,8 +261,6 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     if weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any()):  # else see the timeline
         texts = [f" {skill}" for _, skill in episode.steps] or [""] * weights.shape[1]
         send("skill_weights", weights, [f"{i}{text}" for i, text in enumerate(texts, 1)])
-    if episode.corrected is not None:
-        send("corrected", episode.corrected[:, None], ["of the correction"])
     return logged
 
 

@@ -89,7 +89,7 @@ def open_viewer(
             files.append(stack.enter_context(readable(recording)))
             with damaged(recording):
                 reader = RrdReader(files[-1])
-                known, tabs, front, at = reader.recordings()[0], Tabs.read(reader), episode, step
+                (known, *_), tabs, front, at = reader.recordings(), Tabs.read(reader), episode, step
                 if tabs is not None and episode is not None:
                     try:
                         tabs.index(episode)
@@ -153,7 +153,7 @@ def find_recordings(path: AnyPath) -> list[Path]:
 
 @contextmanager
 def damaged(recording: Path) -> Iterator[None]:
-    """Convert any error of reading a recording to a :class:`ValueError`, also Rerun's panics."""
+    """Convert any error of reading a recording, including Rerun's panics, to a :class:`ValueError`."""
     try:
         yield
     except (KeyboardInterrupt, SystemExit, MemoryError, OSError):

@@ -140,7 +140,7 @@ class SeenRows:
         cameras = self._cameras = self._cameras or Cameras()
         return np.stack([cameras.picture(*self._seen(row), camera=camera, height=height, width=width) for row in rows])
 
-    def model(self, row: int) -> RowModel:
+    def row_model(self, row: int) -> RowModel:
         """Return a row's MuJoCo model."""
         return self._seen(row)[0]
 

@@ -26,7 +26,7 @@ class EngineStep(NamedTuple):
 @runtime_checkable
 class Engine(Protocol):
     """A simulator of N parallel environments, called rows. To support camera images, an engine also implements
-    ``render`` as in :class:`~lw_torchrl.suites.cameras.SeenRows`; to support recordings of the scene, ``model`` and
+    ``render`` as in :class:`~lw_torchrl.suites.cameras.SeenRows`; to support recordings of the scene, ``row_model`` and
     ``poses``.
     """
 

@@ -19,7 +19,7 @@ from lw_torchrl.suites.engine import Engine
 @typed_fields
 @dataclass(frozen=True)
 class Suite:
-    """A set of tasks for one simulator and robot, which is passed as ``suite=`` argument.
+    """A set of tasks for one simulator and robot. Functions accept a suite as the argument ``suite``.
 
     Attributes:
         name: the suite's name, for example "fetch"; the tasks are then called "fetch/push" etc.
@@ -109,8 +109,6 @@ def load_suite(suite: str | Suite) -> Suite:
     """
     if isinstance(suite, Suite):
         return suite
-    if not isinstance(suite, str):
-        raise TypeError(f"suite must be a suite's name or a Suite, got {shown(suite)}")
     if suite not in SUITES:
         advice = f"pass a Suite object, or register the suite: lw.suites.SUITES[{suite!r}] = ... (see also --import)"
         raise ValueError(f"{unknown_name('suite', suite, SUITES)} For a custom suite, {advice}")
@@ -132,7 +130,7 @@ def listed_tasks(tasks: Any) -> Any:
 
 
 def find_suite(tasks: Any, suite: str | Suite | None = None) -> Suite:
-    """Return ``suite``, or, if ``suite`` is None, the suite to which the tasks' names belong (see :func:`suite_name`).
+    """Return ``suite`` unless it is None; otherwise infer the suite from the tasks' names (see :func:`suite_name`).
 
     Raises:
         ValueError: the tasks belong to several suites or to an unknown suite.

@@ -12,17 +12,18 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 PACKAGES = ("torch", "torchrl", "tensordict", "lw_torchrl")
-"""The packages whose modules do not change their Python attributes from step to step."""
+"""The packages whose modules can be captured, because they do not change Python attributes from step to step."""
 _WARM_UP = 2  # number of calls before the capture; the first call creates tables and the optimizer's state
 
 
 def foreign_code(objects: Iterable[Any]) -> str:
-    """Return the name of a class or function, of the objects and their submodules, that is not from :data:`PACKAGES`;
-    "" if there is none.
+    """Return the name of the first class or function that is defined outside :data:`PACKAGES`, or "".
+
+    The search covers the objects and their submodules.
     """
     for item in objects:
         for part in item.modules() if isinstance(item, nn.Module) else [item]:
-            function = getattr(part, "func", None)  # of a transform that wraps a function
+            function = getattr(part, "func", None)  # the function in a transform that wraps one
             codes: list[Any] = [type(part), function if hasattr(function, "__qualname__") else type(function)]
             for code in codes:
                 if code is not NoneType and code.__module__.partition(".")[0] not in PACKAGES:
@@ -36,18 +37,18 @@ def captures(device: torch.device) -> bool:
 
 
 class CapturedFunction:
-    """A function of a minibatch that runs on a CUDA device as one CUDA graph, and on other devices as it is.
+    """A function of a minibatch that runs as one CUDA graph on a CUDA device, and normally on other devices.
 
     A graph repeats the function's kernels on the same memory without running Python, so the function may depend only on
-    the minibatch and on tensors. The first two calls run the function. If the second call waits for the device, or the
-    capture fails, a warning says why, and all later calls run the function.
+    the minibatch and on tensors. The first two calls run the function without a graph. If the second call waits for the
+    device, or if the capture fails, a warning states the reason, and all later calls also run without a graph.
 
     Args:
         function: a function of a TensorDict on the device, which returns tensors by name.
         device: the device.
 
     Attributes:
-        tries: whether the function is, or will be, captured; set it to False to run the function as it is.
+        tries: whether to capture the function; set it to False to run the function without a graph.
         is_captured: whether the function runs as a graph.
     """
 
@@ -93,7 +94,7 @@ class CapturedFunction:
         return {name: value.clone() for name, value in self._outputs.items()}  # the next replay overwrites the values
 
     def _run(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
-        """Run the function, in the last call before the capture with a look at what waits for the device."""
+        """Run the function; in the last call before the capture, detect operations that wait for the device."""
         assert self._module is not None
         if self._stream is None:
             return self._function(minibatch)
@@ -123,7 +124,7 @@ class CapturedFunction:
         self._graph, self.is_captured = graph, True
 
     def give_up(self, reason: str) -> None:
-        """Run the function without a graph from now on, and warn that this is for ``reason``."""
+        """Warn with the ``reason``, and run the function without a graph in all later calls."""
         self.tries = False
         warnings.warn(f"training steps run without a CUDA graph, and therefore slower: {reason}", stacklevel=2)
 
@@ -147,7 +148,7 @@ def _watched(call: Callable[[], Any], module: Any) -> tuple[Any, str]:
 
 
 def _pinned(tensor: Tensor, device: torch.device) -> Tensor:
-    """Return a tensor that can be copied to the device without waiting: a copy in pinned memory if on the CPU."""
+    """Return a tensor that can be copied to the device without waiting; copy a CPU tensor to pinned memory first."""
     return tensor.pin_memory() if tensor.is_cpu and device.type == "cuda" else tensor
 
 

@@ -84,7 +84,7 @@ def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> No
 
     Args:
         evaluator: the evaluator; a custom class must store the keyword arguments of its constructor in ``config``.
-        path, **about: see :func:`save_actor`, also for the errors.
+        path, **about: see :func:`save_actor`, which also lists the errors.
 
     Example:
         >>> import lw_torchrl as lw, os, tempfile
@@ -108,7 +108,7 @@ def load_evaluator(
 
     Args:
         path, text_encoder, parts: see :func:`load_actor`, which also lists the errors.
-        plans: the plans; raises :class:`ValueError` if the evaluator cannot evaluate a plan's conditions.
+        plans: the plans to evaluate; a :class:`ValueError` is raised if the evaluator cannot evaluate their conditions.
     """
     answered = [as_plans(plans).to_json()]
     evaluator: QueryEvaluator = _load(
@@ -182,7 +182,7 @@ def text_vectors(module: nn.Module) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def _copy_tensors(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> None:
-    """Copy weights in place; raise :class:`ValueError` where names, shapes, dtypes or text vectors differ."""
+    """Copy weights in place; raise :class:`ValueError` if names, shapes, dtypes or text vectors differ."""
     if different := sorted(stored.keys() ^ live.keys()):
         raise ValueError(f"the file and the module must have the same tensors, but differ in {different[:8]}")
     weights = {name: tensor for name, tensor in live.items() if not name.startswith(_TEXTS)}
@@ -209,7 +209,8 @@ def check_finite(weights: Mapping[str, Tensor]) -> None:
 
 
 def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
-    """Raise an error unless a module can be saved and loaded; called before training so that no training is lost."""
+    """Raise an error unless a module can be saved and loaded. Trainers call this before training, so that the trained
+    weights can be saved."""
     widths = [vectors.shape[-1] for vectors in text_vectors(module).values()] or [TEXT_DIMENSION]
     custom = [type(part) for part in module.modules() if not type(part).__module__.startswith("torch.")]
     description = json.loads(json.dumps(describe(module)))
@@ -269,7 +270,9 @@ def check_description(path: Path, expected: Mapping[str, Any], stored: Mapping[s
 
 
 class CheckpointFiles:
-    """The files of one training: a policy or evaluator, and the training state next to it, with a lock against others.
+    """The checkpoint files of a training run: a policy or evaluator, and the training state next to it.
+
+    A lock file prevents concurrent runs from writing to them.
 
     Args:
         checkpoint: the path of the policy, evaluator or training state.
@@ -279,14 +282,17 @@ class CheckpointFiles:
     def __init__(self, checkpoint: AnyPath, part: str | None) -> None:
         self.checkpoint, self.part = expanded(checkpoint), part
         self.state = training_file(self.checkpoint) if part else self.checkpoint
-        self._known: tuple[int, ...] | None = None  # identifies the last version of the training state read or written
+        self._known: tuple[int, ...] | None = None  # identifies the training state that this run last read or wrote
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the files within a ``with`` block, so that no other training writes them."""
+        """Lock the files within a ``with`` block, so that no other training run writes to them.
+
+        Raise :class:`ValueError` if another run has written to them since this run read or wrote them.
+        """
         with locked(self.checkpoint, "checkpoint", "training"):
             if self._version() not in (None, self._known):
-                message = "was written by another training after this training began; start again to resume from it"
+                message = "was written by another training run in the meantime; start this run again to resume from it"
                 raise ValueError(f"checkpoint: {str(self.checkpoint)!r} {message}, or choose another file")
             yield
 
@@ -306,7 +312,8 @@ class CheckpointFiles:
             _write(self.checkpoint, self.part, description, contents_of(part))
 
     def exist(self) -> bool:
-        """Return whether the training state exists; raise ValueError if only the policy exists, to keep the policy."""
+        """Return whether the training state exists; raise ValueError if only the policy exists, which training would
+        overwrite."""
         if not self.state.exists() and self.checkpoint.exists():
             message = f"{str(self.checkpoint)!r} exists, but its training state {str(self.state)!r} does not"
             raise ValueError(f"checkpoint: {message}; choose another file, or delete this file to start again")
@@ -320,7 +327,8 @@ class CheckpointFiles:
         load_state: Callable[[dict[str, Any]], None],
     ) -> None:
         """Copy the stored tensors into ``tensors`` and pass the stored state to ``load_state``."""
-        name, version = f"checkpoint: {str(self.state)!r}", self._version()
+        name = f"checkpoint: {str(self.state)!r}"
+        self._known = self._version()
         stored_description, stored = _read(self.state, "training")
         check_description(self.state, description, stored_description)
         if self.part is not None and self.checkpoint.exists():
@@ -340,4 +348,3 @@ class CheckpointFiles:
         except (ValueError, KeyError, TypeError, RuntimeError) as error:
             message = f"{name} does not fit: the file is corrupted, or was written for a different architecture"
             raise ValueError(f"{message} ({_one_line(error)})") from error
-        self._known = version

@@ -30,7 +30,7 @@ _MOST_WEIGHT = 20.0  # maximum weight of a rare answer, as a multiple of the med
 
 
 class _StateQueries:
-    """A source of minibatches of (state, clause) pairs, with equally many pairs of each predicate and truth value."""
+    """A source of minibatches of (state, clause) pairs, equally many for each predicate and truth value."""
 
     def __init__(self, evaluator: ClauseEvaluator, tasks: list[TaskQueries]) -> None:
         self.observation = torch.cat([task.observation for task in tasks])
@@ -52,20 +52,17 @@ class _StateQueries:
         self.truths = torch.tensor([number % 2 == 1 for number in sorted(groups)])
         self.digest = _digest((self.observation, self.pairs, self.sizes))
 
-    def sample(self, size: int) -> TensorDictBase:
-        """Draw ``observation`` (B, 39) float32, ``clauses`` (B, 1) and the clauses' ``truth`` (B, 1) float32."""
-        return self.rows(self.draw(size))
-
     def draw(self, size: int) -> TensorDict:
         """Draw the indices of B states and clauses, and the clauses' truth, (B,) each, on the CPU."""
-        # Cycle through the groups from a random start, so that a batch smaller than their number favors none.
+        # Begin at a random group, so that a batch with fewer pairs than there are groups does not favor any group.
         group = (torch.arange(size) + torch.randint(len(self.sizes), ())) % len(self.sizes)
         place = (torch.rand(size, dtype=torch.float64) * self.sizes[group]).long()
         row, clause = self.pairs[self.starts[group] + place].long().unbind(-1)
         return TensorDict(row=row, clause=clause, truth=self.truths[group])
 
     def rows(self, drawn: TensorDictBase) -> TensorDictBase:
-        """Return the minibatch for what :meth:`draw` returned, on its device."""
+        """Return ``observation`` (B, 39) float32, ``clauses`` (B, 1) and the clauses' ``truth`` (B, 1) float32 for a
+        result of :meth:`draw`, on the device of that result."""
         truth, clauses = drawn["truth"][:, None].float(), self.clauses.pick(drawn["clause"][:, None])
         return TensorDict(observation=self.observation[drawn["row"]], truth=truth, clauses=_as_tensordict(clauses))
 
@@ -80,7 +77,7 @@ class _StateQueries:
 
 
 class _PictureQueries:
-    """A source of minibatches of images, equally many per task, with each image's clauses and object positions."""
+    """A source of minibatches of images, equally many per task, with the clauses and object positions of each image."""
 
     def __init__(self, evaluator: ImageQueryEvaluator, tasks: list[TaskQueries]) -> None:
         for task in tasks:
@@ -92,17 +89,13 @@ class _PictureQueries:
         self.positions = [_known_positions(task, evaluator.names) for task in tasks]
         self.digest = _digest(part for task in tasks for part in (task.observation, task.truth, task.view("pixels")))
 
-    def sample(self, size: int) -> TensorDictBase:
-        """Draw about ``size`` states in total, as one nested TensorDict per task with the same number of states."""
-        return self.rows(self.draw(size))
-
     def draw(self, size: int) -> TensorDict:
-        """Draw the indices (B,) of each task's states, on the CPU."""
+        """Draw the indices of about ``size`` states in total, equally many of each task, on the CPU."""
         each = max(1, size // len(self.tasks))
         return TensorDict({task.task.name: torch.randint(len(task.observation), (each,)) for task in self.tasks})
 
     def rows(self, drawn: TensorDictBase) -> TensorDictBase:
-        """Return the minibatch for what :meth:`draw` returned, on its device."""
+        """Return a nested TensorDict for each task, on the device of ``drawn``, a result of :meth:`draw`."""
         batch = TensorDict()
         for number, (task, pixels, truth) in enumerate(zip(self.tasks, self.pixels, self.truths, strict=True)):
             rows, clauses = drawn[task.task.name], self.clauses[number]
@@ -151,10 +144,10 @@ def _on(clauses: Clauses, device: torch.device) -> Clauses:
 
 
 def _known_positions(queries: TaskQueries, names: tuple[str, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the indices (n,) int64 of a task's objects in ``names``, their positions and openings, and a mask.
+    """Return the indices (n,) int64 of a task's objects in ``names``, the values (R, n, 4) float32, and a mask (n, 4).
 
-    Three coordinates and the opening (how far the object is open) form a tensor (R, n, 4) float32; the mask (n, 4) is 1
-    where a value is known.
+    The four values are an object's coordinates and its opening (how far the object is open). The mask is 1 for values
+    that are known.
     """
     own = [name for name in queries.task.object_names if name in names]
     positions, openings = queries.task.positions(queries.observation), queries.task.openings
@@ -189,8 +182,9 @@ def _digest(tensors: Iterable[Tensor]) -> str:
 class QueryEvaluatorTrainer(Training):
     """A trainer that fits an evaluator of observations or pictures to the exact answers to all base queries of tasks.
 
-    A minibatch of observations holds equally many (state, clause) pairs of each predicate and truth value. A minibatch
-    of pictures holds equally many states of each task with all clauses of the task, weighted to the same effect.
+    A base query is a single clause, such as "the gripper is near the puck". A minibatch of observations holds equally
+    many (state, clause) pairs of each predicate and truth value. A minibatch of pictures holds equally many states of
+    each task, with all clauses of the task; weights in the loss balance predicates and truth values.
 
     Args:
         evaluator: the evaluator, trained in place; the evaluator's plans do not affect training.

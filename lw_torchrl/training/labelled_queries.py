@@ -1,4 +1,4 @@
-"""LabelledQueries: the exact answers to all base queries of tasks in the states of a dataset."""
+"""LabelledQueries: the exact answers to all base queries of the tasks, in each state of a dataset."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class QueryEvaluatorConfig:
         learning_rate: initial learning rate, which decays to 0 on a cosine schedule.
         states_per_task: maximum number of training states per task, drawn from the rows of the task.
         every: use every N-th state of an episode; with pictures, N is the number of time steps between pictures.
-        held_out_states: fraction of each task's episodes whose states are held out, at most 0.9.
-        held_out_pairs: fraction of the pairs of object names that are held out in all tasks, at most 0.9.
+        held_out_states: fraction of each task's episodes whose states are held out; at least one episode is not.
+        held_out_pairs: fraction of the pairs of object names that are held out in all tasks; at least one pair is not.
         held_out_tasks: names of the held-out tasks, or the number of held-out tasks to draw.
         seed: seed for drawing the held-out splits, the training states and the minibatches.
     """
@@ -51,11 +51,6 @@ class QueryEvaluatorConfig:
     held_out_tasks: Natural | tuple[str, ...] = 0
     seed: int = 0
     checkpoint_every: Count = 500
-
-    def __post_init__(self) -> None:
-        for name in ("held_out_states", "held_out_pairs"):
-            if getattr(self, name) > 0.9:
-                raise ValueError(f"{name} must be at most 0.9, got {getattr(self, name)}")
 
 
 @typed_fields
@@ -78,7 +73,7 @@ class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
 
 @dataclass(frozen=True)
 class TaskQueries:
-    """Exact answers to Q clauses (none of them negated) in R states of a task.
+    """The exact answers to Q clauses, none of which is negated, in R states of a task.
 
     Attributes:
         observation: the states, (R, 39) float32.
@@ -104,7 +99,9 @@ class TaskQueries:
 
 
 class LabelledQueries:
-    """Exact answers to all base queries of a dataset's tasks, including queries that no plan uses, split for training.
+    """The exact answers to all base queries of a dataset's tasks, split into training data and held-out data.
+
+    A base query is a single clause, such as "the gripper is near the puck". Queries that no plan uses are included.
 
     Attributes:
         tasks, held_out_tasks: the names of the training tasks and of the held-out tasks.
@@ -192,7 +189,7 @@ def _at_most(number: int, rows: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _check_pictures(rows: TensorDictBase, layout: Layout) -> None:
-    """Raise ValueError if consecutive pictures are equal although the hand moved, since one shows an earlier state."""
+    """Raise ValueError if consecutive pictures are equal although the hand moved: one then shows an earlier state."""
     pixels, hand = rows.get("pixels", None), rows.get("observation")[:, layout.positions[0]]
     if pixels is None or len(rows) < 2:
         return
@@ -223,7 +220,7 @@ def _draw_pairs(fraction: float, tasks: Sequence[Task], generator: torch.Generat
 
 
 def _held_out_rows(episode: Tensor, ids: Tensor, fraction: float) -> Tensor:
-    """Return a mask (R,) bool of the rows in held-out episodes, a fraction of each task's episodes, evenly spaced.
+    """Return a bool mask (R,) of the rows in held-out episodes: an evenly spaced fraction of each task's episodes.
 
     Episodes with the same index start in the same state in every dataset, so they are held out together.
     """

@@ -55,7 +55,7 @@ def _rate_factor(config: Any, step: int) -> float:
 
 
 def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int) -> None:
-    """Set the learning rates after ``step`` optimizer steps."""
+    """Set the learning rates to their values after ``step`` optimizer steps."""
     for group in optimizer.param_groups:
         rate = group["initial_lr"] * _rate_factor(config, step)
         if isinstance(group["lr"], Tensor):
@@ -189,13 +189,14 @@ class Training:
         self._captured: CapturedFunction | None = None
 
     def losses(self, batch: Any) -> Mapping[str, Tensor]:
-        """Return a minibatch's loss terms, whose names begin with "loss" and which are added, and values to log."""
+        """Return the loss terms of a minibatch, and other values to log, by name. Terms whose names begin with "loss"
+        are added."""
         raise NotImplementedError(f"{type(self).__name__} must implement losses")
 
     def step(self) -> Tensor:
-        """Train on one minibatch; return the loss () float32, or (M,) for M models, which the device may still compute.
+        """Train on one minibatch and return the loss, () float32, or (M,) for M models, without waiting for the device.
 
-        The networks' random numbers are those of the first of :attr:`minibatches`.
+        The first of :attr:`minibatches` seeds the random numbers of the networks.
         """
         first, *others = self.minibatches
         drawn = []
@@ -210,7 +211,7 @@ class Training:
         return values["loss"]
 
     def _run(self, drawn: Any) -> dict[str, Tensor]:
-        """Run :meth:`update` on what was drawn, on a CUDA device as one CUDA graph."""
+        """Run :meth:`update` on drawn minibatches; on a CUDA device, run it as one CUDA graph."""
         if self._captured is None:
             captured = CapturedFunction(lambda each: self.update(self.batch(each)), self.device)
             parts = [self, self.module, *self.networks]
@@ -223,12 +224,12 @@ class Training:
         return self._captured(drawn, tuple(network.training for network in self.networks))
 
     def combined(self, drawn: list[Any]) -> Any:
-        """Combine what was drawn from each of :attr:`minibatches`."""
+        """Combine the draws from all :attr:`minibatches`."""
         (only,) = drawn
         return only
 
     def batch(self, drawn: Any) -> Any:
-        """Return the minibatch for what :meth:`combined` returned, now on the device."""
+        """Return the minibatch for a result of :meth:`combined`, which must be on the device."""
         return self.minibatches[0].rows(drawn)
 
     def update(self, batch: Any) -> dict[str, Tensor]:
@@ -342,7 +343,7 @@ class Training:
         return read["loss"]
 
     def save(self) -> None:
-        """Check that all weights are finite, and write the checkpoint, if any, atomically replacing existing files."""
+        """Check that all weights are finite, then write the checkpoint files atomically if ``checkpoint`` is set."""
         try:
             check_finite(self.parameters())
         except ValueError as error:
@@ -374,7 +375,7 @@ class Training:
         rates = [group["lr"] for group in self.optimizer.param_groups]
         self.optimizer.load_state_dict(state["optimizer"])
         for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate  # on a GPU a tensor there, which the state holds on the CPU
+            group["lr"] = rate  # on a GPU, keep the optimizer's GPU tensor instead of the state's CPU tensor
         self._captured = None  # a CUDA graph would use the old state
         self.steps = state["step"]
         _set_learning_rates(self.optimizer, self.config, self.steps)

@@ -28,41 +28,35 @@ _REPLAY_OPTIONS = ("label", "reward", "terminate_on_success", "n_steps", "gamma"
 
 
 class Minibatches:
-    """A source of minibatches drawn from a replay buffer, or from any object with a method ``sample(size)``.
+    """A source of minibatches drawn from a replay buffer, or from an object with methods ``draw(size)`` and ``rows``.
 
     The random numbers of sampler, transforms and networks depend only on the seed and the index of the minibatch.
     Samplers draw on the CPU, so minibatches are the same on every device. If the rows are on a GPU, only their indices
-    are drawn on the CPU, and a CUDA graph can contain the rest.
+    are drawn on the CPU; a CUDA graph can then gather and transform the rows.
     """
 
     def __init__(self, source: Any, size: int, seed: int, device: torch.device = CPU) -> None:
         self.source, self.size, self.seed, self.step = source, size, seed, 0
-        self._indexed: Any = None
-        if device != CPU:
-            self._indexed = source if hasattr(source, "draw") else IndexedReplay.of(source, device)
+        # The source from which `draw` draws only indices.
+        self.indexed: Any = source if hasattr(source, "draw") else IndexedReplay.of(source, device)
         if hasattr(source, "set_rng"):
             source.set_rng(torch.default_generator)  # the generator that `drawing` seeds
 
     @contextmanager
     def drawing(self, device: torch.device) -> Iterator[None]:
         """Seed PyTorch's generators within a ``with`` block in which one minibatch is drawn and trained on."""
-        # A large factor keeps the random numbers of trainings with adjacent seeds apart.
+        # The large factor prevents training runs with adjacent seeds from using the same random numbers.
         with seeded(device, (self.seed * 1_000_003 + self.step) % 2**63):
             self.step += 1
             yield
 
     def draw(self) -> Any:
-        """Draw a minibatch; or, if the rows are on a GPU, only their indices, on the CPU."""
-        return self.source.sample(self.size) if self._indexed is None else self._indexed.draw(self.size)
-
-    @property
-    def indexed(self) -> Any:
-        """The source that :meth:`draw` draws only indices of; None if it draws whole minibatches."""
-        return self._indexed
+        """Draw a minibatch. If the rows are on a GPU, draw only their indices, on the CPU."""
+        return self.source.sample(self.size) if self.indexed is None else self.indexed.draw(self.size)
 
     def rows(self, drawn: Any) -> Any:
-        """Return the minibatch for what :meth:`draw` returned, which must be on the device."""
-        return drawn if self._indexed is None else self._indexed.rows(drawn)
+        """Return the minibatch for a result of :meth:`draw`, which must be on the device."""
+        return drawn if self.indexed is None else self.indexed.rows(drawn)
 
     def state_dict(self) -> dict[str, Any]:
         sampler = getattr(self.source, "sampler", None)
@@ -75,15 +69,15 @@ class Minibatches:
 
 
 class IndexedReplay:
-    """A replay buffer with rows on a GPU, whose minibatches are made in two parts: indices on the CPU, then rows."""
+    """A wrapper of a replay buffer with rows on a GPU, which first draws indices on the CPU and then gathers rows."""
 
     def __init__(self, replay: TensorDictReplayBuffer) -> None:
         self.replay, self._given = replay, _GivenRows()
 
     @classmethod
     def of(cls, source: Any, device: torch.device) -> IndexedReplay | None:
-        """Return the replay buffer as such a source, or None if its rows are elsewhere or its indices need the rows."""
-        if not isinstance(source, TensorDictReplayBuffer) or not isinstance(source.storage, TensorStorage):
+        """Wrap a replay buffer; return None unless its rows are on this GPU and its sampler can draw on the CPU."""
+        if device == CPU or not isinstance(source.storage, TensorStorage):
             return None
         is_here = device_of_rows(source.storage) == device and source.storage.ndim == 1
         has_draw = isinstance(source.sampler, GroupSampler) or (
@@ -122,7 +116,7 @@ class _GivenRows(RandomSampler):
 
 
 def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, size: int) -> None:
-    """Raise :class:`ValueError` unless a buffer's minibatches suit the networks and training on them can resume."""
+    """Raise :class:`ValueError` unless a buffer's minibatches fit the networks and training on them can be resumed."""
     for network in networks:
         own = plans_of(network)
         for answered in map(plans_of, replay.transform):

@@ -71,7 +71,8 @@ def make_loss(name: str, actor: TensorDictModuleBase, plans: Plans, replay: Tens
 def learn_advantages(
     plans: Plans, replay: TensorDictReplayBuffer, config: OfflineConfig, device: torch.device, **options: Any
 ) -> Tensor:
-    """Train a value by expectile regression and return each row's advantage (R, 1) float32, standardized per task.
+    """Train a state-value network by expectile regression, and return the advantage (R, 1) float32 of each row,
+    standardized per task.
 
     The buffer must have ``n_steps`` = :data:`N_STEPS` and ``gamma`` = :data:`GAMMA`.
     """
@@ -127,11 +128,11 @@ class OfflineTrainer(Training):
         **options: keyword arguments of :class:`~lw_torchrl.training.loop.Training`, which also lists their errors.
 
     Raises:
-        ValueError: the buffer evaluates the conditions of other plans, has a PrioritizedSampler, or lacks rewards or
-            next observations that the loss reads; the buffer's n-step ``gamma`` differs from the value estimator's; the
-            loss is not reduced to a mean, or is a CQLLoss with a Lagrange multiplier; with ``normalize``, a network was
-            fitted to other statistics; or the buffer has RandomYaw or JitterTarget, and the loss would not pass their
-            keys on to FocusFeatures or RoleFeatures.
+        ValueError: the buffer does not fit: it evaluates the conditions of other plans, has a PrioritizedSampler, lacks
+            rewards or next observations that the loss reads, has an n-step ``gamma`` that differs from the value
+            estimator's, or has RandomYaw or JitterTarget, whose keys the loss would not pass on to FocusFeatures or
+            RoleFeatures. Or the loss does not fit: it is not reduced to a mean, is a CQLLoss with a Lagrange
+            multiplier, or, with ``normalize``, contains a network that was fitted to other statistics.
         TypeError: the loss is not a LossModule.
 
     Example:

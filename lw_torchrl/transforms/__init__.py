@@ -1,15 +1,13 @@
-"""TorchRL transforms that add condition answers, pictures or task descriptions, and augmentations of datasets."""
+"""TorchRL transforms that write answers to conditions, pictures or task descriptions, or augment sampled rows."""
 
 import lw_torchrl._util.keys  # noqa: F401
-from lw_torchrl.transforms.augmentation import HideOpening, JitterTarget, SwapUnmentioned
-from lw_torchrl.transforms.camera import CameraTransform
-from lw_torchrl.transforms.environment import EnvState, LanguageInstruction
+from lw_torchrl.transforms.augmentation import JitterTarget, SwapUnmentioned
 from lw_torchrl.transforms.fallback_turns import FallbackTurns
+from lw_torchrl.transforms.observations import CameraTransform, LanguageInstruction, SuiteTransform
 from lw_torchrl.transforms.qaf import CorruptQAF, QAFTransform
 from lw_torchrl.transforms.random_yaw import RandomYaw
-from lw_torchrl.transforms.suite_transform import SuiteTransform
 
 __all__ = [
-    "CameraTransform", "CorruptQAF", "EnvState", "FallbackTurns", "HideOpening", "JitterTarget", "LanguageInstruction",
-    "QAFTransform", "RandomYaw", "SuiteTransform", "SwapUnmentioned",
+    "CameraTransform", "CorruptQAF", "FallbackTurns", "JitterTarget", "LanguageInstruction", "QAFTransform",
+    "RandomYaw", "SuiteTransform", "SwapUnmentioned",
 ]  # fmt: skip

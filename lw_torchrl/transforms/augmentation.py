@@ -1,4 +1,4 @@
-"""Augmentations for replay buffers, which keep a policy from relying on accidental details of demonstrations."""
+"""Augmentations for replay buffers, which prevent a policy from relying on irrelevant details of demonstrations."""
 
 from __future__ import annotations
 
@@ -9,38 +9,27 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import TensorSpec
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import Transform
 
 from lw_torchrl._util.checks import Probability, Scale, typed
 from lw_torchrl._util.devices import plain
-from lw_torchrl._util.keys import Keys, as_keys, check_apart, read
-from lw_torchrl.language.layout import METAWORLD, Layout, places
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside, read
+from lw_torchrl.language.layout import places
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.roles import StepRole
 from lw_torchrl.language.task_index import PlanTables, answers_of
 from lw_torchrl.language.tasks import role_object
-from lw_torchrl.transforms.qaf import plan_number_key
 
-ACTIVE = 0.01  # a plan step with more attention is active; a false step has about 1e-4 if another step is true
+# A plan step with more attention is active. If any condition is true, a step with a false condition gets about 1e-4.
+ACTIVE = 0.01
 
 
 class Augmentation(Transform):
     """Base class for transforms that randomly change sampled rows. Using one in an environment raises a TypeError."""
 
-    def _refuse(self) -> NoReturn:
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> NoReturn:
         name = type(self).__name__
         raise TypeError(f"{name} is only for replay buffers: in an environment it would change the policy's input")
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._refuse()
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        self._refuse()
-
-    def set_container(self, container: Transform | EnvBase) -> None:
-        if isinstance(container, EnvBase):
-            self._refuse()
-        super().set_container(container)
 
     def table(self, name: str, device: torch.device) -> Tensor:
         """Return the buffer ``name`` on a device, and keep the buffer there for later batches."""
@@ -55,7 +44,7 @@ class Augmentation(Transform):
 class PlanAugmentation(Augmentation):
     """A base class of augmentations that depend on which steps of a row's plan are active.
 
-    A plan step is active if its attention weight is above 0.01, see :class:`~lw_torchrl.modules.PlanAttention`.
+    A plan step is active if its attention weight is above 0.01 (see :class:`~lw_torchrl.modules.PlanAttention`).
     """
 
     steps: Tensor
@@ -68,9 +57,10 @@ class PlanAugmentation(Augmentation):
         return plans
 
     def answers(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor, Tensor]:
-        """Return qaf (B, S), row indices of the tables (B,) int64, and a mask (B, S) bool of the turn's steps."""
+        """Return ``qaf`` (B, S), row indices of the tables (B,) int64, and a mask (B, S) bool of the steps that are
+        available in the current turn (see :class:`FallbackTurns`)."""
         qaf, task_id = read(tensordict, keys)
-        qaf, rows = answers_of(qaf, task_id, tensordict.get(plan_number_key(keys[0]), None), self._tables)
+        qaf, rows = answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), self._tables)
         if qaf.shape != (shape := (*rows.shape, self._tables.mask.shape[-1])):
             raise ValueError(f"qaf must have shape {shape}, one column for each step of plans, got {tuple(qaf.shape)}")
         turn = tensordict.get("turn", None)
@@ -87,13 +77,14 @@ class PlanAugmentation(Augmentation):
 
 
 class SwapUnmentioned(PlanAugmentation):
-    """An augmentation that replaces the positions of objects that no active plan step mentions by those of another row.
+    """An augmentation that takes the positions of objects that no active plan step mentions from another row.
 
-    A policy then cannot rely on these objects. A plan step mentions the objects and the goal that its condition and
-    skill name. For replay buffers, after a :class:`QAFTransform`, which must see the unchanged scene.
+    A policy then cannot rely on these objects. A plan step mentions the objects, and the goal, that are named in the
+    step's condition or skill. For replay buffers, after a :class:`QAFTransform`, which must see the unchanged scene.
 
     Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); changes ``observation`` (B, D) and ``("next", "observation")`` in
-    the same way: an object stays if an active step of either mentions it. Draws from PyTorch's global generator.
+    the same way. An object keeps its position if a step that is active in either observation mentions it. Draws from
+    PyTorch's global generator.
 
     Args:
         plans: the plans whose conditions ``qaf`` answers.
@@ -165,45 +156,6 @@ class SwapUnmentioned(PlanAugmentation):
         return tensordict
 
 
-class HideOpening(Augmentation):
-    """An augmentation that replaces the gripper's opening with that of another row.
-
-    The opening often reveals the task of a demonstration. For replay buffers. Changes ``observation`` (B, D), not
-    ``("next", "observation")``. Draws from PyTorch's global generator.
-
-    Args:
-        probability: probability of replacing the opening of a row.
-        layout: the layout of the observations.
-        in_keys: a replacement for the key ``observation``.
-
-    Raises:
-        TypeError: the transform is used in an environment.
-
-    Example:
-        >>> import torch, lw_torchrl as lw
-        >>> from tensordict import TensorDict
-        >>> rows = TensorDict(observation=torch.rand(8, 39), batch_size=[8])
-        >>> lw.transforms.HideOpening(1.0)(rows)["observation"].shape
-        torch.Size([8, 39])
-    """
-
-    @typed
-    def __init__(self, probability: Probability, *, layout: Layout = METAWORLD, in_keys: Keys | None = None) -> None:
-        keys = as_keys("in_keys", in_keys, ("observation",))
-        super().__init__(in_keys=keys, out_keys=keys)
-        self.probability, self._opening = probability, layout.opening
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        observation = read(tensordict, self.in_keys)[0].clone()
-        if not observation.numel():
-            return tensordict  # there is no row to take the opening from
-        opening = observation[..., self._opening]
-        others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
-        hidden = torch.rand(opening.shape, device=opening.device, dtype=torch.float32) < self.probability
-        observation[..., self._opening] = torch.where(hidden, others, opening)
-        return tensordict.copy().set(self.in_keys[0], observation)
-
-
 class JitterTarget(PlanAugmentation):
     """An augmentation that draws a random target offset for rows in which an active plan step pushes or pulls.
 
@@ -258,7 +210,7 @@ def mentioned(plans: Plans, tables: PlanTables) -> Tensor:
     for task, plan in plans.items():
         for number, step in enumerate(plan.steps):
             objects = [role_object(plan.definition, name) for name in step.mentions(plan.definition)]
-            # An int is an index into the observation, a float a fixed number of metres.
+            # An int is an index into the observation; a float is a constant coordinate in metres.
             indices = {place for item in objects for place in item.position if isinstance(place, int)}
             table[tables.index.row(task), number] = torch.tensor([not indices.isdisjoint(own) for own in numbers])
     return table

@@ -1,4 +1,4 @@
-"""Transforms that save an environment's state or write task descriptions, and helpers for other transforms."""
+"""Base classes of transforms that keep state, and helpers for other transforms."""
 
 from __future__ import annotations
 
@@ -7,16 +7,11 @@ import warnings
 from typing import Any, Self
 
 import torch
-from tensordict import NonTensorData, NonTensorStack, TensorDictBase, unravel_key
+from tensordict import unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, NonTensor, TensorSpec
 from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
-
-from lw_torchrl._util.checks import typed
-from lw_torchrl._util.keys import Keys, as_keys, read
-from lw_torchrl.language.tasks import TASKS, TaskList, named_tasks, task_id
 
 
 def base_env(transform: Transform) -> EnvBase | None:
@@ -35,7 +30,7 @@ def refuse_changed(transform: Transform, key: NestedKey) -> None:
     for earlier in reversed(_before(transform)):
         written = [unravel_key(out) for out in earlier.__dict__.get("_out_keys") or ()]
         if getattr(earlier, "makes_observation", False):
-            return  # earlier transforms do not matter: this transform writes the original observation
+            return  # this transform writes the original observation, so earlier changes do not matter
         if isinstance(earlier, RenameTransform) and key in written:
             key = unravel_key(earlier.in_keys[written.index(key)])
         elif key in written or unravel_key(("next", key)) in written:
@@ -69,7 +64,7 @@ def _flat(transform: Transform) -> list[Transform]:
 
 
 class EpisodeTransform(Transform):
-    """A base class for transforms that keep per-episode state; reset the environment after cloning or loading them."""
+    """A base class of transforms that keep state per episode. After cloning or loading one, reset the environment."""
 
     def _forget_episodes(self) -> None:
         """Delete the state of all episodes, so that a reset is required."""
@@ -85,7 +80,13 @@ class EpisodeTransform(Transform):
 
 
 class KeepsEnvState(EpisodeTransform):
-    """A base class of transforms whose ``state_dict`` includes that of the environment, which TorchRL does not save."""
+    """A base class of transforms that save the environment's state in their own ``state_dict``.
+
+    TorchRL does not save this state, so a resumed Collector would run the same episodes again. After
+    ``load_state_dict``, reset the environment (``collector.reset()``). Around a ParallelEnv, such a transform does not
+    call ``ParallelEnv.load_state_dict``, which desynchronizes the workers in TorchRL 0.14.1 unless
+    ``use_buffers=False``.
+    """
 
     def get_extra_state(self) -> Tensor:
         """Return the environment's ``state_dict`` as bytes (n,) uint8, or an empty tensor on a replay buffer."""
@@ -110,96 +111,6 @@ class KeepsEnvState(EpisodeTransform):
         if (flags := env.__dict__.get("_shm_done_flags")) is not None:
             # TorchRL 0.14.1 does not clear these flags after loading: a ParallelEnv would reset too early.
             flags[:] = [0] * len(flags)
-
-
-class EnvState(KeepsEnvState):
-    """A transform that adds the environment's seed and episode counters to the ``state_dict`` of a TransformedEnv.
-
-    Without this transform, or a :class:`QAFTransform`, which does the same, a resumed Collector would run the same
-    episodes again. After ``load_state_dict``, reset the environment (``collector.reset()``). Also use this transform
-    around a ParallelEnv, unless ``use_buffers=False``: in TorchRL 0.14.1, ``ParallelEnv.load_state_dict``
-    desynchronizes the workers.
-
-    Raises:
-        ValueError: the loaded state belongs to other tasks or rows, or has no environment state.
-
-    Warns:
-        UserWarning: a SerialEnv or ParallelEnv that is closed, or not started, has no state to save.
-
-    Example:
-        >>> from torchrl.envs import TransformedEnv
-        >>> import lw_torchrl as lw
-        >>> env, other = (TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.EnvState()) for _ in range(2))
-        >>> _ = env.reset(), env.reset(), other.load_state_dict(env.state_dict())
-        >>> other.reset()["episode"]
-        tensor([2])
-    """
-
-    def __init__(self) -> None:
-        super().__init__(in_keys=[], out_keys=[])
-
-
-class LanguageInstruction(Transform):
-    """A transform that writes ``language_instruction``, the task description: "Push the puck to the target location."
-
-    Policies such as ``torchrl.modules.VLAWrapperBase`` read this key. For environments and replay buffers. Reads
-    ``task_id`` (B,) int64; writes one string for each row. Strings make an environment step 1.15 to 2.5 times slower,
-    so :class:`~lw_torchrl.LanguageWorldEnv` does not write them itself.
-
-    Args:
-        tasks: the tasks whose descriptions are known, as for :class:`~lw_torchrl.LanguageWorldEnv`, or their plans;
-            None for the 50 tasks and the tasks of the environment.
-        in_keys, out_keys: replacements for the keys ``task_id`` and ``language_instruction``.
-
-    Raises:
-        ValueError: at call time, a task is not among ``tasks``.
-
-    Example:
-        >>> from torchrl.envs import TransformedEnv
-        >>> import lw_torchrl as lw
-        >>> env = TransformedEnv(lw.LanguageWorldEnv(["reach", "push"]), lw.transforms.LanguageInstruction())
-        >>> env.reset()["language_instruction"][0] == lw.TASKS["push"].description
-        True
-
-    Source: ``torchrl.envs.LiberoEnv``.
-    """
-
-    @typed
-    def __init__(
-        self, tasks: TaskList | None = None, *, in_keys: Keys | None = None, out_keys: Keys | None = None
-    ) -> None:
-        keys = as_keys("in_keys", in_keys, ("task_id",))
-        super().__init__(in_keys=keys, out_keys=as_keys("out_keys", out_keys, ("language_instruction",)))
-        known = TASKS.values() if tasks is None else named_tasks(tasks).values()
-        self._texts = {task_id(task.name): NonTensorData(task.description) for task in known}
-
-    def _text(self, number: int) -> NonTensorData:
-        if number not in self._texts:
-            for task in getattr(base_env(self), "task_of_row", ()):
-                self._texts.setdefault(task_id(task.name), NonTensorData(task.description))
-        if number not in self._texts:
-            raise ValueError(f"task_id {number} is not among the tasks of LanguageInstruction: pass tasks=")
-        return self._texts[number]
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        (ids,) = read(next_tensordict, self.in_keys)
-        shape = next_tensordict.batch_size
-        texts = [self._text(number) for number in ids.reshape(-1).tolist()]
-        value: Any = texts[0] if not shape else NonTensorStack(*texts).reshape(shape)
-        return next_tensordict.set(self.out_keys[0], value)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict)
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        assert isinstance(observation_spec, Composite)
-        shape, device = observation_spec.shape, observation_spec.device
-        example = next(iter(self._texts.values())).data
-        observation_spec[self.out_keys[0]] = NonTensor(shape, example_data=example, device=device)
-        return observation_spec
 
 
 def reset_rows(before: Tensor | None, now: Tensor, begun: Tensor | None, more: int = 0) -> Tensor:

@@ -1,4 +1,4 @@
-"""FallbackTurns: switch between a plan and its fallback plan when nothing moves any more."""
+"""FallbackTurns: alternate between a plan and its fallback plan when neither the hand nor an object moves."""
 
 from typing import NamedTuple
 
@@ -19,17 +19,18 @@ class _Rows(NamedTuple):
 
     turn: Tensor  # B int64
     waited: Tensor  # B int64, time steps without motion
-    lasted: Tensor  # B int64, time steps of the turn
-    stood: Tensor  # (B, P, 3), metres, positions at the last motion
+    lasted: Tensor  # B int64, time steps since the turn began
+    stood: Tensor  # (B, P, 3), metres, positions when something last moved
 
 
 class FallbackTurns(Transform):
-    """A transform that counts the turns of an episode: the plan, letting go, one motion; the plan, letting go, another.
+    """A transform that counts the turns of an episode, in which a plan alternates with its fallback plan.
 
-    A turn ends when neither the hand nor an object has moved farther than ``still`` for ``patience`` time steps, and
-    after at most ``longest`` time steps; a turn that lets go lasts ``release`` time steps.
-    :class:`~lw_torchrl.modules.PlanAttention` reads the turn if the plans have fallback steps, see
-    :func:`~lw_torchrl.canonical_plans`.
+    Six turns form a cycle. In turns 0 and 3 the policy follows the plan, in turns 1 and 4 it releases the object, and
+    in turns 2 and 5 it tries the two motions of the fallback plan. A turn ends when neither the hand nor an object has
+    moved farther than ``still`` for ``patience`` time steps, and after at most ``longest`` time steps; turns 1 and 4
+    last ``release`` time steps. :class:`~lw_torchrl.modules.PlanAttention` reads the turn if the plans have fallback
+    steps, see :func:`~lw_torchrl.canonical_plans`.
 
     In an environment, the transform reads ``observation`` (B, 39) float32, metres, and writes ``turn`` (B,) int64, from
     0. Rows of a replay buffer keep the recorded ``turn``; rows without ``turn`` get 0.
@@ -38,7 +39,7 @@ class FallbackTurns(Transform):
         layout: the layout of the observations.
         patience: number of time steps without motion that end a turn.
         longest: maximum length of a turn, in time steps.
-        release: length of a turn that lets go of an object, in time steps.
+        release: length of a turn that releases the object, in time steps.
         still: the largest distance, in metres, that does not count as motion.
         in_keys, out_keys: replacements for the keys ``observation`` and ``turn``.
 
@@ -52,7 +53,7 @@ class FallbackTurns(Transform):
         >>> env.rollout(12, lambda td: td.set("action", td["observation"].new_zeros(1, 4)))["turn"].max()
         tensor(2)
 
-    Source: original to this library; time-outs of a behavior tree's fallback node.
+    Source: original to this library, after the time-outs of fallback nodes in behavior trees.
     """
 
     @typed

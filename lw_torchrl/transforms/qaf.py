@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
@@ -14,7 +13,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from lw_torchrl._util.checks import Count, Natural, Probability, missing_keys, typed
 from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside, read
-from lw_torchrl._util.reproducibility import episode_generator
+from lw_torchrl._util.reproducibility import episode_hash
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.task_index import PlanTables, TaskTables, one_per_row
@@ -27,7 +26,6 @@ from lw_torchrl.transforms.environment import (
 )
 
 _HALF = (torch.float16, torch.bfloat16)  # too coarse for positions in metres: conditions compare centimetres
-_BLOCK = 64  # number of time steps whose random numbers are drawn together
 
 
 class _Number(NamedTuple):
@@ -39,23 +37,13 @@ def plan_program(plans: Plans) -> QueryProgram:
     return QueryProgram({plan.definition: [step.condition for step in plan.steps] for plan in plans.values()})
 
 
-def plan_number_key(qaf: NestedKey) -> NestedKey:
-    """Return the key to which :class:`QAFTransform` writes the plan's number: ``qaf_plan`` for ``qaf``."""
-    return key_beside(qaf, "_plan")
-
-
-def latches_key(qaf: NestedKey) -> NestedKey:
-    """Return the key to which :class:`QAFTransform` writes the latches: ``qaf_latches`` for ``qaf``."""
-    return key_beside(qaf, "_latches")
-
-
 def latches_of_rows(program: QueryProgram, observation: Tensor, task_id: Tensor, trajectory: Tensor) -> Tensor:
     """Compute the latches (R, L) bool in all rows of whole episodes.
 
     Args:
         program: the program of the plans' conditions.
         observation, task_id: (R, D) float and (R,) int64, the rows of consecutive episodes in the order of time.
-        trajectory: (R,) int64, a number that changes where an episode begins.
+        trajectory: (R,) int64, a number for each row that changes where a new episode begins.
     """
     latches = torch.zeros(len(task_id), program.num_latches, dtype=torch.bool, device=observation.device)
     is_first = torch.ones(len(task_id), dtype=torch.bool, device=observation.device)
@@ -70,7 +58,7 @@ def latches_of_rows(program: QueryProgram, observation: Tensor, task_id: Tensor,
 
 
 def truth_of_episode(plans: Plans, steps: TensorDictBase) -> Tensor:
-    """Return the truth (T, S) bool of the plans' conditions in the steps (T,) of one episode, with its latches."""
+    """Return the truth (T, S) bool of the plans' conditions, which may refer to earlier steps, in one episode (T,)."""
     program, observation, task_id = plan_program(plans), steps.get("observation"), steps.get("task_id")
     if not program.num_latches:
         return program(observation, task_id)
@@ -82,16 +70,16 @@ class QAFTransform(KeepsEnvState):
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf`` (B, S) bool, the truth value of
     each plan step's condition (false beyond the last step), and ``qaf_plan`` (B,) int64, the plan's number in
-    :attr:`Plans.numbers`, by which an actor with other plans rejects the answers. On a replay buffer, it also
+    :attr:`Plans.numbers`, with which an actor detects answers to other plans. On a replay buffer, the transform also
     writes ``("next", "qaf")`` if ``("next", "observation")`` exists. In an environment, the ``state_dict`` includes
-    that of the environment, as for :class:`EnvState`.
+    that of the environment, so that a resumed Collector continues with the next episodes.
 
-    If a condition has latches ("the puck has been near the goal", "once (...)"), it also writes ``qaf_latches``
-    (B, L) bool: the latches that are true since an earlier or this step of the episode. In an environment, every reset
-    of a row clears its latches. Rows of a replay buffer must have this key: rollouts have it, and
-    :class:`LanguageWorldExperienceReplay` computes it.
+    If conditions depend on earlier steps ("the puck has been near the goal", "once (...)"), the transform also writes
+    ``qaf_latches`` (B, L) bool. A latch becomes true when its condition first holds, and stays true until the episode
+    ends. Rows of a replay buffer must have this key: rollouts have it, and :class:`LanguageWorldExperienceReplay`
+    computes it.
 
-    Conditions compare metres, so put this transform before transforms that change the observation, such as
+    Conditions compare distances in metres, so put this transform before transforms that change the observation, such as
     ``ObservationNorm`` or :class:`RandomYaw`. A wrong order raises an error, except in the workers of a SerialEnv or
     ParallelEnv.
 
@@ -121,8 +109,8 @@ class QAFTransform(KeepsEnvState):
         keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
         plans = as_plans(plans)
         program = plan_program(plans)
-        latches = [latches_key(truth[0])] if program.num_latches else []
-        super().__init__(in_keys=keys, out_keys=[*truth, plan_number_key(truth[0]), *latches])
+        beside = ("_plan", "_latches") if program.num_latches else ("_plan",)
+        super().__init__(in_keys=keys, out_keys=[*truth, *(key_beside(truth[0], ending) for ending in beside)])
         check_apart(self.in_keys, self.out_keys)
         self.plans, self.program = plans, program
         tables = PlanTables(self.plans)
@@ -134,7 +122,7 @@ class QAFTransform(KeepsEnvState):
         return QAFTransform(plans, in_keys=self.in_keys, out_keys=self.out_keys[:1])
 
     def _write(self, tensordict: TensorDictBase, task_id: Tensor | None, before: Tensor | None = None) -> None:
-        """Write the answers, and the latches that follow from those ``before``."""
+        """Write the answers, and the latches after this step, given the latches ``before`` this step."""
         observation = tensordict.get(self.in_keys[0], None)
         if observation is None or task_id is None:
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys))
@@ -149,14 +137,14 @@ class QAFTransform(KeepsEnvState):
             truth = self.program(observation, task_id)
         tensordict.set(self.out_keys[0], truth)
         number = self._number.select(task_id.reshape(-1), observation).plan
-        tensordict.set(self.out_keys[1], number.reshape(task_id.shape).clone())  # a collector zeroes it in place
+        tensordict.set(self.out_keys[1], number.reshape(task_id.shape).clone())  # collectors zero the tensor in place
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         before = None
         if self.program.num_latches:
             before = tensordict.get(self.out_keys[2], None)
             if before is None:
-                raise ValueError(f"a step requires {self.out_keys[2]!r}, the latches before it, which a reset writes")
+                raise ValueError(f"the input of a step lacks {self.out_keys[2]!r}, which a reset writes")
         self._write(next_tensordict, next_tensordict.get(self.in_keys[1], None), before)
         return next_tensordict
 
@@ -167,9 +155,9 @@ class QAFTransform(KeepsEnvState):
         return tensordict_reset
 
     def _cleared(self, tensordict: TensorDictBase, fresh: TensorDictBase, begun: Tensor | None) -> Tensor | None:
-        """Return the latches of all rows, false in the rows that are reset.
+        """Return the latches of all rows after a reset of the rows ``begun``, which sets their latches to false.
 
-        If TorchRL passes no latches, it restores those of the other rows itself.
+        If ``tensordict`` lacks the latches, all become false, and TorchRL restores those of the other rows.
         """
         observation = fresh.get(self.in_keys[0], None)
         if not self.program.num_latches or observation is None:
@@ -186,8 +174,8 @@ class QAFTransform(KeepsEnvState):
             if before is None:
                 raise ValueError(
                     f"the plans' conditions depend on earlier steps ('has been', 'once (...)'), but the rows have no "
-                    f"{self.out_keys[2]!r}: use a rollout with this QAFTransform or LanguageWorldExperienceReplay("
-                    "transform=QAFTransform(plans)), which compute it per episode"
+                    f"{self.out_keys[2]!r}; use rows of a rollout with this QAFTransform, or "
+                    "LanguageWorldExperienceReplay(transform=QAFTransform(plans))"
                 )
         self._write(tensordict, task_id, before)
         following = tensordict.get("next", None)
@@ -261,7 +249,7 @@ class CorruptQAF(EpisodeTransform):
         >>> lw.evaluate(actor, tasks="reach", episodes_per_task=2, seed=1_000, evaluator=noisy).success_once
         {'reach': 1.0}
 
-    Source: the paper suggests a visual question answering model as query answering function, which makes errors.
+    Source: the paper suggests a visual question answering model to check conditions; such a model makes errors.
     """
 
     @typed
@@ -282,14 +270,14 @@ class CorruptQAF(EpisodeTransform):
         self._tables = PlanTables(self.plans)
         self._task: Tensor | None = None  # B int64, the tasks of the rows' episodes
         self._episode: Tensor | None = None
-        self._plan = torch.empty(0, dtype=torch.int64)  # B int64, row indices of the tables
+        self._plan = self._key = torch.empty(0, dtype=torch.int64)  # B int64, row indices of the tables; random keys
+        self._real = torch.empty(0, dtype=torch.bool)  # (B, S), false beyond the end of a plan
         self._forget_episodes()
 
     def _forget_episodes(self) -> None:
         self._places = -(-self.delay // self.every) + 1  # maximum number of stored answers
         self._steps: Tensor | None = None  # B int64, time steps since each row's reset
         self._answers: Tensor | None = None  # (B, places, S); the n-th update is at place n % places
-        self._draws = _Draws(self.seed, self._tables, self.plans)
 
     def with_plans(self, plans: AnyPlans) -> CorruptQAF:
         """Return a transform that corrupts the answers of different plans in the same way."""
@@ -301,11 +289,20 @@ class CorruptQAF(EpisodeTransform):
         begun = tensordict.get("_reset", None)
         self._task, self._episode = reset_rows(self._task, task, begun), reset_rows(self._episode, episode, begun)
         self._plan = self._tables.rows(self._task)
-        self._tables.refuse_others(tensordict_reset.get(plan_number_key(self.in_keys[0]), None), self._plan)
+        self._tables.refuse_others(tensordict_reset.get(key_beside(self.in_keys[0], "_plan"), None), self._plan)
         shape = (*self._plan.shape, self.plans.num_steps)
         if truth.shape != shape or not (truth.dtype == torch.bool or truth.is_floating_point()):
             got = f"{truth.dtype} of shape {tuple(truth.shape)}"
             raise ValueError(f"qaf must be bool (or float, for soft truth values) of shape {shape}, got {got}")
+        if self.flip:
+            plans = [self.plans[self._tables.index.tasks[row]] for row in self._plan.flatten().cpu().tolist()]
+            numbers = self._episode.flatten().clamp(min=0).cpu().tolist()  # -1: a row that was never reset
+            keys = [
+                episode_hash("answers/flip", plan.definition, self.seed, number)
+                for plan, number in zip(plans, numbers, strict=True)
+            ]
+            self._key = torch.tensor(keys, device=self._plan.device).reshape(self._plan.shape)
+            self._real = self._tables.mask.to(self._plan.device)[self._plan]
         self._steps = reset_rows(self._steps, torch.zeros_like(self._plan), begun)
         self._answers = reset_rows(self._answers, torch.stack([truth] * self._places, -2), begun, 2)
         return self._show(tensordict_reset)
@@ -328,11 +325,10 @@ class CorruptQAF(EpisodeTransform):
     def _show(self, tensordict: TensorDictBase) -> TensorDictBase:
         assert self._steps is not None
         assert self._answers is not None
-        assert self._episode is not None
         place = self._place((self._steps - self.delay).clamp(min=0))[..., None, None]
         answers = self._answers.gather(-2, place.expand(*place.shape[:-1], self._answers.shape[-1])).squeeze(-2)
         if self.flip:
-            wrong = self._draws(self._plan, self._episode, self._steps) < self.flip
+            wrong = self._real & (_uniform(self._key, self._steps, self._real.shape[-1]) < self.flip)
             answers = answers ^ wrong if answers.dtype == torch.bool else torch.where(wrong, 1 - answers, answers)
         return tensordict.set(self.in_keys[0], answers)
 
@@ -350,31 +346,13 @@ class CorruptQAF(EpisodeTransform):
         return observation_spec
 
 
-class _Draws:
-    """Uniform random numbers for answers, in blocks of time steps, by (task, seed, episode, block); padding is 1."""
+def _uniform(key: Tensor, step: Tensor, width: int) -> Tensor:
+    """Return numbers (B, width) float64 in [0, 1), hashes of a key (B,) int64, a time step (B,) int64 and the column.
 
-    def __init__(self, seed: int, tables: PlanTables, plans: Plans) -> None:
-        self._seed = seed
-        self._plans = [plans[task] for task in tables.index.tasks]
-        self._width = plans.num_steps
-        self._which = torch.empty(0, 3, dtype=torch.int64)  # the table row, episode and block of each row
-        self._numbers = torch.empty(0, _BLOCK, self._width, dtype=torch.float32)
-
-    def __call__(self, rows: Tensor, episode: Tensor, step: Tensor) -> Tensor:
-        """Return numbers (B, S) float64 in [0, 1] for table rows, episodes and time steps (each B int64)."""
-        which = torch.stack([each.reshape(-1).cpu() for each in (rows, episode, step // _BLOCK)], -1)
-        if which.shape != self._which.shape:
-            self._which = torch.full_like(which, -1)
-            self._numbers = torch.ones(len(which), _BLOCK, self._width, dtype=torch.float64)
-        if not torch.equal(which, self._which):
-            for place in (which != self._which).any(-1).nonzero().flatten().tolist():
-                row, number, block = which[place].tolist()
-                if number < 0:  # never reset
-                    continue
-                plan = self._plans[row]
-                generator = episode_generator(f"answers/flip/{block}", plan.definition, self._seed, number)
-                steps = len(plan.steps)
-                self._numbers[place, :, :steps] = torch.from_numpy(generator.random((_BLOCK, steps)))
-            self._which = which
-        numbers = self._numbers[torch.arange(len(which)), step.reshape(-1).cpu() % _BLOCK]
-        return numbers.reshape(*step.shape, -1).to(step.device)
+    Source: Steele, Lea, Flood, "Fast splittable pseudorandom number generators" (SplitMix64).
+    """
+    counter = step.unsqueeze(-1) * 2**32 + torch.arange(1, width + 1, device=step.device)
+    bits = key.unsqueeze(-1) + counter * -0x61C8864680B583EB  # products of int64 wrap around
+    for shift, factor in ((30, -0x40A7B892E31B1A47), (27, -0x6B2FB644ECCEEE15), (31, 1)):
+        bits = (bits ^ (bits >> shift & 2 ** (64 - shift) - 1)) * factor
+    return (bits >> 11 & 2**53 - 1).to(torch.float64) * 2**-53

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase, unravel_key
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lw_torchrl._util.checks import Probability, Scale, missing_keys, typed
@@ -23,7 +22,7 @@ _places: dict[tuple[tuple[int, ...], torch.device], Tensor] = {}
 
 
 def _places_on(starts: tuple[int, ...], device: torch.device) -> Tensor:
-    """Return the indices (2P,) int64 of all x, then of all y, for P pairs; the tensor is made once for each device."""
+    """Return the indices (2P,) int64 of the P x coordinates, then of the P y coordinates, cached for each device."""
     if (places := _places.get((starts, device))) is None:
         with torch.inference_mode(False):  # autograd rejects tensors that were created in inference mode
             places = torch.tensor([*starts, *(start + 1 for start in starts)]).to(device)
@@ -33,7 +32,7 @@ def _places_on(starts: tuple[int, ...], device: torch.device) -> Tensor:
 
 
 def _turned(values: Tensor, starts: tuple[int, ...], cos: Tensor, sin: Tensor) -> Tensor:
-    """Rotate the pairs (x, y) that begin at ``starts`` in ``values`` (..., D), all of them in a few operations."""
+    """Rotate the pairs (x, y) that begin at the indices ``starts`` in ``values`` (..., D)."""
     places = _places_on(starts, values.device)
     x, y = values.index_select(-1, places).split(len(starts), -1)
     cos, sin = cos.unsqueeze(-1), sin.unsqueeze(-1)
@@ -50,16 +49,6 @@ def turn_observation(observation: Tensor, angle: Tensor, layout: Layout = METAWO
 def turn_vectors(vectors: Tensor, angle: Tensor) -> Tensor:
     """Rotate vectors (..., 3) about the vertical axis by (...) radians."""
     return _turned(vectors, (0,), angle.cos(), angle.sin())
-
-
-def yaw_key(observation: NestedKey) -> NestedKey:
-    """Return the key of the angle that :class:`RandomYaw` writes next to ``observation``, ``observation_yaw``."""
-    return key_beside(observation, "_yaw")
-
-
-def tilt_key(observation: NestedKey) -> NestedKey:
-    """Return the key of the rotation that :class:`RandomYaw` writes next to ``observation``, ``observation_tilt``."""
-    return key_beside(observation, "_tilt")
 
 
 def random_rotations(number: int, device: torch.device | None = None) -> Tensor:
@@ -84,11 +73,11 @@ class RandomYaw(PlanAugmentation):
 
     Changes ``observation`` (B, 39), ``action`` (B, 4), and, if present, ``expert_action``, ``unclipped_action``
     (B, 4) and ``("next", "observation")``, all float32. Writes the angle in radians, ``observation_yaw`` (B,) float32,
-    and ``("next", "observation_yaw")``, by which features rotate fixed places. An action's horizontal displacement is
-    shortened if it would leave [-1, 1]. Orientations are not rotated: use features without orientations, "differences"
-    or "relative". Angles are drawn from PyTorch's global generator; the angles of repeated rotations add up. TorchRL's
-    losses, except BCLoss, do not pass the angle on to the features, so :class:`~lw_torchrl.OfflineTrainer` rejects
-    these losses.
+    and ``("next", "observation_yaw")``, with which features also rotate constant positions. An action's horizontal
+    displacement is shortened if it would leave [-1, 1]. Orientations are not rotated, so use features without
+    orientations: "differences" or "relative". Angles are drawn from PyTorch's global generator; the angles of repeated
+    rotations add up. TorchRL's losses, except BCLoss, do not pass the angle on to the features, so
+    :class:`~lw_torchrl.OfflineTrainer` rejects these losses.
 
     Args:
         scale: standard deviation of the angle, in radians; with 10, the angle is nearly uniform.
@@ -157,7 +146,8 @@ class RandomYaw(PlanAugmentation):
         return torch.where(self._all_true(tensordict, "free"), any_angle, angle)
 
     def _all_true(self, tensordict: TensorDictBase, name: str) -> Tensor:
-        """Return (B,) bool: whether a plan step is true, and the table ``name`` is true for all true plan steps."""
+        """Return whether the conditions of one or more plan steps are true, and ``name`` is true for all these steps,
+        (B,) bool; ``name`` is a table (T, S) bool."""
         qaf, rows, steps = self.answers(tensordict, ["qaf", "task_id"])
         true = (qaf > 0.5) & steps
         return (self.table(name, rows.device)[rows] | ~true).all(-1) & true.any(-1)
@@ -177,23 +167,24 @@ class RandomYaw(PlanAugmentation):
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys[:2]))
         angle = self._angle(tensordict, observation)
         tilt = self._tilt(tensordict) if self.tilt else None
-        old_yaw, old_tilt = tensordict.get(yaw_key(source), None), tensordict.get(tilt_key(source), None)
+        old_yaw, old_tilt = (tensordict.get(key_beside(source, ending), None) for ending in ("_yaw", "_tilt"))
         yaw = angle if old_yaw is None else old_yaw + angle
         if old_tilt is not None:  # express an earlier tilt in the rotated axes
             old_tilt = turn_vectors(turn_vectors(old_tilt.mT, angle.unsqueeze(-1)).mT, angle.unsqueeze(-1))
-            tensordict.set(tilt_key(target), old_tilt if tilt is None else tilt @ old_tilt)
+            tensordict.set(key_beside(target, "_tilt"), old_tilt if tilt is None else tilt @ old_tilt)
         elif tilt is not None:
-            tensordict.set(tilt_key(target), tilt)
+            tensordict.set(key_beside(target, "_tilt"), tilt)
         cos, sin, begin = angle.cos(), angle.sin(), self._begin
-        tensordict.set(target, turn_observation(observation, angle, self.layout)).set(yaw_key(target), yaw)
+        tensordict.set(target, turn_observation(observation, angle, self.layout))
+        tensordict.set(key_beside(target, "_yaw"), yaw)
         if (following := tensordict.get(unravel_key(("next", source)), None)) is not None:
             after = unravel_key(("next", target))
-            tensordict.set(after, turn_observation(following, angle, self.layout)).set(yaw_key(after), yaw)
+            tensordict.set(after, turn_observation(following, angle, self.layout)).set(key_beside(after, "_yaw"), yaw)
         for key, turned_key in actions:
             if (action := tensordict.get(key, None)) is None:
                 continue
             turned = _turned(action, (begin,), cos, sin)
-            # Shorten displacements that leave [-1, 1], unless they were outside before, as unclipped actions may be.
+            # Shorten displacements that leave [-1, 1], unless they were outside before (as in unclipped actions).
             plane = slice(begin, begin + 2)
             before, now = (each[..., plane].abs().amax(-1, keepdim=True) for each in (action, turned))
             turned[..., plane] /= torch.where(before <= 1.0, now.clamp(min=1.0), 1.0)

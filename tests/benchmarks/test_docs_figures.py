@@ -1,7 +1,5 @@
 """The figures of README and docs: they are drawn, and their numbers are those that the pages print."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

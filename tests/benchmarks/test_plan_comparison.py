@@ -1,14 +1,11 @@
-"""python -m benchmarks.plan_comparison decodes and runs every answer, and equal plans only once."""
-
-from __future__ import annotations
+"""python -m benchmarks.plan_comparison decodes and runs every answer."""
 
 import json
 
 import pytest
 
 import lw_torchrl as lw
-from benchmarks import plan_comparison
-from benchmarks.plan_comparison import Arguments, compare_plans, main, no_plans, write_report
+from benchmarks.plan_comparison import Arguments, compare_plans, main, no_plans
 from lw_torchrl.planners import answer_path
 
 PLANS = lw.load_plans("MT10")
@@ -48,41 +45,6 @@ def test_every_answer_is_compared(answers):
     assert no_plans(comparison) == ["answers without a plan: 4", f"4: {reason}"]
 
 
-def test_the_best_answer_is_chosen_and_counted_in_different_episodes():
-    def answer(attempt, success):
-        return plan_comparison.ComparedAnswer("m", "chain_py", "reach", attempt, 1, 0, "", success)
-
-    lucky = answer(0, (True, False, True, False))  # in all episodes that choose, in none of the others
-    sound = answer(1, (True, True, False, True))
-    assert plan_comparison.PlanComparison([lucky, sound], {}).best_of("m", "chain_py") == 0.0
-    assert plan_comparison.PlanComparison([sound], {}).best_of("m", "chain_py") == 1.0
-
-
-def test_stopped_comparison_resumes_with_the_remaining_plans(answers, tmp_path, monkeypatch):
-    kept = tmp_path / "success.json"
-    whole = compare_plans(answers, **SHORT).to_json()
-    monkeypatch.setattr(plan_comparison, "_SAVE_SECONDS", 0.0)
-    real, numbers = plan_comparison.evaluate_plans, []
-
-    def stopped(plans, *, on_plan, **options):
-        numbers.append(len(plans))
-
-        def after_one(index, success):
-            on_plan(index, success)
-            raise KeyboardInterrupt
-
-        return real(plans, on_plan=after_one if len(numbers) == 1 else on_plan, **options)
-
-    monkeypatch.setattr(plan_comparison, "evaluate_plans", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        compare_plans(answers, resume=kept, **SHORT)
-    assert compare_plans(answers, resume=kept, **SHORT).to_json() == whole
-    assert compare_plans(answers, resume=kept, **SHORT).to_json() == whole
-    assert numbers == [2, 1], "equal plans run once, and finished plans not again"
-    with pytest.raises(ValueError, match=r"max_steps \(60, now 50\)"):
-        compare_plans(answers, resume=kept, **SHORT | {"max_steps": 50})
-
-
 def test_command_writes_a_report_and_the_best_plans(tmp_path, capsys):
     good = PLANS["drawer-open"]
     bad = lw.ConditionalPlan("drawer-open", good.steps[:1])  # it stays above the handle
@@ -99,8 +61,3 @@ def test_command_writes_a_report_and_the_best_plans(tmp_path, capsys):
     assert (tmp_path / "out/formats.png").is_file()
     assert not (tmp_path / "out/models.png").exists(), "the models have no task in common"
     assert "answers without a plan: 1" in capsys.readouterr().out
-
-
-def test_report_has_both_figures(answers, tmp_path):
-    written = write_report(compare_plans(answers, **SHORT), tmp_path)
-    assert [file.name for file in written] == ["results.json", "summary.md", "models.png", "formats.png", "best"]

@@ -1,7 +1,5 @@
 """Custom tasks, plans, skills and text encoders, with the same options in every command."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -80,24 +78,6 @@ def test_a_policy_is_trained_with_custom_files(capsys, tmp_path):
     assert (tmp_path / "out" / "rollout.rrd").is_file()
     error = fails(capsys, "train", "demos", "--out", tmp_path / "p", "--text-encoder", "my_texts:nothing", *TINY)
     assert "--text-encoder" in error
-
-
-@pytest.mark.slow
-def test_a_policy_with_custom_texts_works_in_other_processes(forks, own, tmp_path):
-    """Train, evaluate, record and fine-tune, each in a process that has not encoded any text."""
-    plan = PLAN.replace("the ball", "the reach target")
-    (tmp_path / "mine.plan").write_text(plan)  # the plan itself says which task it is for
-    policy, tuned = tmp_path / "policy.safetensors", tmp_path / "tuned.safetensors"
-    for command in (
-        ("train", own / "demos", "--tasks", "reach", "--plans", tmp_path / "mine.plan", "--out", policy, *TINY),
-        ("evaluate", policy, "--episodes", 1, "--stop-at-success", "--out", tmp_path / "evaluated"),
-        ("record", "reach", "--policy", policy, "--out", tmp_path / "rollout.rrd"),
-        ("train", own / "demos", "--tasks", "reach", "--begin", policy, "--out", tuned, "--steps", 5),
-        ("evaluate", tuned, "--episodes", 1, "--stop-at-success", "--out", tmp_path / "again"),
-    ):
-        forks.start(*command)
-        ended = forks.end()
-        assert ended.status == 0, (command, ended.err)
 
 
 def test_a_task_without_a_simulator_is_an_error(capsys, tmp_path):

@@ -1,7 +1,5 @@
 """``lw-torchrl collect`` and ``data``: collect, summarise, check and convert datasets."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """``lw-torchrl info`` without arguments: the installation and the machine."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -19,9 +19,6 @@ def push(robot):
 """
 
 
-# ---- tasks
-
-
 def test_tasks_are_listed(capsys, monkeypatch):
     printed = run(capsys, "tasks", "MT10")
     assert "10 tasks" in printed
@@ -50,9 +47,6 @@ def test_a_task_is_shown_with_its_plan_queries_and_skills(capsys):
     assert [row["query"] for row in shown["task"]["queries"]] == list(lw.supported_queries("drawer-open"))
     skill = lw.load_skills()[shown["skills"][0]["skill"]].for_task("drawer-open")
     assert shown["skills"][0]["offset"] == [*skill.offset]
-
-
-# ---- query
 
 
 def state_after(task, step, seed=0):
@@ -87,9 +81,6 @@ def test_without_a_text_all_queries_that_hold_are_listed(capsys):
     assert answer == {"query": "the robot's gripper is open", "holds": True}
     assert "teapot" in fails(capsys, "query", "reach", "the gripper is near the teapot")
     assert "--step must be at most 500" in fails(capsys, "query", "reach", "--step", 501)
-
-
-# ---- check
 
 
 def test_a_valid_plan_passes_the_check(capsys, tmp_path):

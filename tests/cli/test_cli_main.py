@@ -1,7 +1,5 @@
 """The command line as a whole: help pages, exit codes, ``--import``, pipes."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
@@ -68,10 +66,16 @@ print([name for name in ("torch", "torchrl", "mujoco", "rich") if name in sys.mo
         (["tasks", "raech"], "did you mean 'reach'"),
         (["tasks", "--import", "no_such_module"], "No module named 'no_such_module'"),
         (["evaluate", "nowhere.safetensors"], "no file 'nowhere.safetensors'"),
-        (["collect", "reach", "--out", "OUT", "--episodes", "0"], "--episodes must be at least 1, got 0"),
-        (["collect", "reach", "--out", "OUT", "--noise", "0", "-0.1"], "--noise must be at least 0, got -0.1"),
-        (["evaluate", "random", "--max-steps", "0"], "--max-steps must be at least 1, got 0"),
-        (["train-evaluator", "reach", "--out", "OUT", "--held-out-pairs", "2"], "--held-out-pairs must be from 0 to 1"),
+        (["collect", "reach", "--out", "OUT", "--episodes", "0"], "--episodes must be an integer of at least 1, got 0"),
+        (
+            ["collect", "reach", "--out", "OUT", "--noise", "0", "-0.1"],
+            "--noise must be tuple[finite number of at least",
+        ),
+        (["evaluate", "random", "--max-steps", "0"], "--max-steps must be an integer of at least 1 or None, got 0"),
+        (
+            ["train-evaluator", "reach", "--out", "OUT", "--held-out-pairs", "2"],
+            "--held-out-pairs must be a number from",
+        ),
         (["train", "nowhere", "--out", "OUT"], "nowhere"),
         (["view", "nowhere.rrd"], "nowhere.rrd"),
         (["check", "nowhere.plan"], "no such file, folder or suite: 'nowhere.plan'"),

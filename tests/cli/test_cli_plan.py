@@ -17,47 +17,17 @@ def test_prompt_equals_that_of_plan_prompt(capsys):
     assert printed == lw.planners.plan_prompt("push", "goal_md", vocabulary=True, plans=lw.load_plans("MT50"))
 
 
-def test_read_shows_how_each_step_was_parsed(capsys, tmp_path):
-    file = tmp_path / "coffee-pull.plan"
-    file.write_text(
-        """def coffee_pull(robot):
-    if check("the gripper is not above the mug"):
-        robot.put("the gripper over a mug")
-    if check("the gripper is near the mug"):
-        robot.grab("it")
-    if check("the gripper is near the mug"):
-        robot.bring("the mug to the goal")
-    if check("the gripper is closed"):
-        robot.be("careful")
-"""
-    )
-    title, heads, *lines = run(capsys, "plan", "read", file).rstrip().splitlines()
-    assert title == f"{file}: coffee-pull, completed"
-    assert heads.split() == ["plan", "verb", "object", "target", "note"]
-    assert [re.split(r" {2,}", line.strip()) for line in lines] == [
-        ["if gripper not above mug"],
-        ["put the gripper over a mug", "approach", "robot's gripper", "mug rim"],
-        ["if gripper near mug"],
-        ["grab it", "close", "robot's gripper", "mug rim"],
-        ["bring the mug to the goal", "carry", "mug", "target location"],
-        ["if gripper closed"],
-        ["be careful", "left out: no motion of an object is recognised"],
-        ["completed; policies on canonical plans see:"],
-        ["if gripper not near mug rim"],
-        ["if gripper not above mug rim"],
-        ["place the gripper above the mug rim", "approach", "robot's gripper", "mug rim"],
-        ["else"],
-        ["lower the gripper around the mug rim", "descend", "robot's gripper", "mug rim"],
-        ["else if gripper wide open"],
-        ["close the gripper around the mug rim", "close", "robot's gripper", "mug rim"],
-        ["else"],
-        ["bring the mug to the goal", "carry", "mug", "target location"],
-    ]
-    steps = document(capsys, "plan read", file)["read"]
-    assert [step["seen"] for step in steps] == [False] * 4 + [True] * 4
-    assert steps[5]["path"] == ["if gripper not near mug rim", "else"]
-    assert run(capsys, "plan", "read", "MT50").count("  note") == 50
-    assert run(capsys, "plan", "read", "MT50", "--task", "soccer").startswith("MT50: soccer, ")
+def test_a_plan_in_own_words_can_be_scripted(capsys, tmp_path):
+    file = tmp_path / "mine" / "push.plan"
+    file.parent.mkdir()
+    file.write_text('def push(robot):\n    if check("the gripper is open"):\n        robot.hover("over the puck")\n')
+    evaluate = ["evaluate", "scripted", "--episodes", 1, "--max-steps", 2, "--plans"]
+    error = fails(capsys, *evaluate, file.parent)
+    near = "place the gripper above the puck"
+    assert f"{file}: no scripted skill for step 1 'hover over the puck' (nearest: '{near}')" in error
+    assert f"plan read {file} --scripted --out" in error
+    run(capsys, "plan", "read", file, "--scripted", "--out", tmp_path / "scripts")
+    assert near in run(capsys, *evaluate, tmp_path / "scripts")
 
 
 def test_read_prints_the_tree_of_a_program(capsys, tmp_path):
@@ -131,9 +101,6 @@ def test_read_parses_answers_of_language_models(capsys, tmp_path, format):
     assert "no plan can be read" in fails(capsys, "plan", "read", answer.with_name("push-0.txt"))
 
 
-# ---- generate
-
-
 @pytest.fixture
 def _no_key(monkeypatch):
     for name in ("OPENAI_API_KEY", "OPENAI_BASE_URL"):
@@ -185,9 +152,6 @@ def test_errors_of_generate_are_one_line(capsys, tmp_path):
     assert "push" in fails(capsys, *generate("http://x/v1", tmp_path, "psuh"))
     assert "--format must be one of" in fails(capsys, *generate("http://x/v1", tmp_path, "push", "--format", "chain"))
     assert "OPENAI_API_KEY" in fails(capsys, "plan", "generate", "push", "--model", "m", "--cache", tmp_path / "kept")
-
-
-# ---- repair
 
 
 @pytest.mark.usefixtures("_no_key")

@@ -1,7 +1,5 @@
 """``lw-torchrl train``, ``evaluate``, ``info`` and ``demo``: their output, files, and resuming."""
 
-from __future__ import annotations
-
 import json
 import signal
 import time
@@ -200,18 +198,8 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
     assert json.loads((out / "config.json").read_text()) == json.loads(json.dumps(vars(config)))
     result = lw.EvaluationResult.load(out / "results.json")
     assert result.config["tasks"] == list(config.tasks)
-    assert result.config["episodes_per_task"] == config.episodes_per_task
-    assert result.config["noise_scale"] == 0.1
     assert result.config["seed"] != config.demonstration_seed
     assert result.table() in printed
-    assert (out / "success.png").read_bytes()[-8:-4] == b"IEND"
-    assert (out / "rollout.rrd").read_bytes().startswith(b"RRF")
-    actor = lw.load_actor(out / "checkpoint.safetensors")
-    plans = lw.load_plans("MT10")
-    assert actor.plans == plans
-    for task in config.tasks:
-        (line,) = [line for line in printed.splitlines() if line.strip().startswith(f"{task}: ")]
-        assert any(f"{step.skill} (" in line for step in plans[task].steps)
     assert f"lw-torchrl view {out / 'rollout.rrd'}" in printed
 
     policy = (out / "checkpoint.safetensors").read_bytes()

@@ -85,18 +85,3 @@ def test_custom_policies_and_evaluators_are_recorded(capsys, tmp_path, monkeypat
     wrong = ("record", "reach", "--policy", "scripted", "--evaluator", "my_parts:number")
     assert "--evaluator my_parts:number" in fails(capsys, *wrong)
     assert "requires a policy with plans" in fails(capsys, "record", "reach", "--evaluator", "my_parts:never")
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (("--suite", "metawold"), "did you mean 'metaworld'"),
-        (("--compare", "nowhere.safetensors"), "'nowhere.safetensors'"),
-        (("--device", "cuda:99"), "device"),
-        (("--episodes", -1), "--episodes must be at least 0, got -1"),
-    ],
-)
-def test_a_wrong_option_leaves_no_recording(capsys, tmp_path, monkeypatch, more, message):
-    monkeypatch.chdir(tmp_path)
-    assert message in fails(capsys, "record", "reach", *more)
-    assert not list(tmp_path.rglob("*.rrd"))

@@ -9,8 +9,7 @@ from commands import document, fails, run
 import lw_torchrl as lw
 from lw_torchrl.cli.main import main
 from lw_torchrl.modules import Concat, MLPDecoder, ObservationFeatures, RoleFeatures
-from lw_torchrl.suites import SUITES, load_suite
-from lw_torchrl.suites import suite as suite_module
+from lw_torchrl.suites import load_suite
 
 OWN = """
 from dataclasses import replace
@@ -77,20 +76,6 @@ def test_check_measures_a_suite(capsys, own):
     assert "OFF  fetch/reach  +x moves right" in printed.out
     assert "expected: 10.0 cm along x" in printed.out
     assert "3 measurements of suite 'fetch'" in printed.err
-
-
-def test_import_registers_a_suite(capsys, tmp_path, monkeypatch):
-    (tmp_path / "my_desk.py").write_text(
-        "from dataclasses import replace\nimport lw_torchrl as lw\nfetch = lw.suites.load_suite('fetch')\n"
-        "layout = replace(fetch.layout, name='desk')\n"
-        "tasks = {f'desk/{n[6:]}': replace(t, name=f'desk/{n[6:]}', layout=layout) for n, t in fetch.tasks.items()}\n"
-        "lw.suites.SUITES['desk'] = replace(fetch, name='desk', layout=layout, tasks=tasks, plans=None)\n"
-    )
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(suite_module, "SUITES", dict(SUITES))
-    monkeypatch.setattr(lw.suites, "SUITES", suite_module.SUITES)
-    assert len(document(capsys, "tasks desk", "--import", "my_desk")["tasks"]) == 4
-    assert document(capsys, "tasks desk/push", "--import=my_desk")["task"]["task"] == "desk/push"
 
 
 @pytest.mark.parametrize("name", ["my_robots:nothing", "my_robots:number", "no_module:suite"])

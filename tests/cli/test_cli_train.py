@@ -1,13 +1,8 @@
 """``lw-torchrl train`` with offline losses and evaluators, and ``train-evaluator``."""
 
-from __future__ import annotations
-
 import csv
 import json
-import os
 import re
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -16,7 +11,6 @@ from pictures import why_no_pictures
 
 import lw_torchrl as lw
 from lw_torchrl.cli.main import main
-from lw_torchrl.training.checkpoint import read_description
 
 SMALL = ["--steps", 4, "--batch-size", 8]
 NET = ["--width", 8, "--depth", 1]
@@ -50,9 +44,6 @@ def trained(demos, tmp_path_factory):
     return path
 
 
-# ---- offline losses
-
-
 @pytest.mark.parametrize(
     "loss", ["iql", *(pytest.param(loss, marks=pytest.mark.slow) for loss in ("advantage", "td3-bc", "cql"))]
 )
@@ -83,32 +74,15 @@ def test_success_rates_are_evaluated_and_logged_while_training(capsys, noisy, tm
     assert "--evaluate-seed 0" in error
 
 
+def test_a_loggers_missing_package_is_named_before_anything_is_read(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("lw_torchrl.cli.train.find_spec", lambda name: None)
+    error = fails(capsys, "train", tmp_path / "nothing", "--out", tmp_path / "x.safetensors", "--logger", "wandb")
+    assert "pip install wandb" in error
+
+
 def test_options_of_bc_are_refused_with_another_loss(capsys, noisy, tmp_path):
     out = ["--out", tmp_path / "policy.safetensors", "--loss", "iql", *SMALL, *NET]
     assert "--qaf-anchor" in fails(capsys, "train", noisy, *out, "--qaf-anchor", 1)
-
-
-@pytest.mark.slow
-def test_two_processes_cannot_train_into_one_file(tmp_path):
-    lw.collect_demonstrations("reach", episodes_per_task=1, root=tmp_path / "demos", max_steps=40, progress=False)
-    out = tmp_path / "policy.safetensors"
-    options = [*map(str, NET), "--batch-size", "20", "--steps", "400"]
-    command = [sys.executable, "-m", "lw_torchrl", "train", str(tmp_path / "demos"), "--out", str(out), *options]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    both = [
-        subprocess.Popen([*command, "--seed", str(seed)], env=environment, stderr=subprocess.PIPE, text=True)
-        for seed in (0, 1)
-    ]
-    errors = [process.communicate(timeout=200)[1] for process in both]
-    assert sorted(process.returncode for process in both) == [0, 2], errors
-    (winner,) = (seed for seed, process in enumerate(both) if process.returncode == 0)
-    assert read_description(out)["training"]["seed"] == winner
-    reasons = ("another training is writing to", "was written by another training", "has a different configuration")
-    assert any(reason in errors[1 - winner] for reason in reasons), errors
-    assert [path.name for path in tmp_path.iterdir() if path.name[0] == "."] == []
-
-
-# ---- evaluators
 
 
 def test_a_new_evaluator_is_trained_with_the_policy(capsys, demos, tmp_path):

@@ -1,7 +1,5 @@
 """Small datasets and policies for the tests of this folder, and helpers on their files."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Sequence

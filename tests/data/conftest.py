@@ -1,7 +1,5 @@
 """Datasets that several test files read."""
 
-from __future__ import annotations
-
 import pytest
 from collecting import collect
 

@@ -1,7 +1,5 @@
 """collect_demonstrations in a folder that exists: interrupted, killed, finished, in use, or with other content."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import subprocess
 import sys
@@ -175,17 +173,6 @@ def test_another_configuration_is_an_error_with_the_difference(dataset, name):
     assert tree(dataset.root) == before
 
 
-def test_another_configuration_of_an_unfinished_dataset_is_an_error(tmp_path, monkeypatch):
-    root = tmp_path / "half"
-    interrupt_after(monkeypatch, 0)
-    with pytest.raises(KeyboardInterrupt):
-        collect(root)
-    before = tree(root)
-    with pytest.raises(DatasetError, match="seed"):
-        collect(root, seed=6)
-    assert tree(root) == before
-
-
 def test_a_folder_with_other_files_is_an_error_and_does_not_change(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     (tmp_path / "data").mkdir()
@@ -194,14 +181,6 @@ def test_a_folder_with_other_files_is_an_error_and_does_not_change(tmp_path):
     with pytest.raises(DatasetError, match="not empty"):
         collect(tmp_path)
     assert tree(tmp_path) == before
-
-
-def test_a_file_as_root_is_an_error(tmp_path):
-    path = tmp_path / "demos"
-    path.write_text("a file")
-    with pytest.raises(ValueError, match="root"):
-        collect(path)
-    assert path.read_text() == "a file"
 
 
 def elsewhere(root):

@@ -1,7 +1,5 @@
 """Policies that collect datasets: scripted skills with wrong segments, random actions, trained policies, functions."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -11,7 +9,7 @@ from commands import fails
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -47,17 +45,6 @@ def test_rows_depend_neither_on_num_envs_nor_on_other_tasks(datasets, name, tmp_
     rows = load_rows(datasets[name])
     together = rows[rows["task_id"] == task_id("reach")].exclude("collector")
     assert (together == load_rows(alone).exclude("collector")).all()
-
-
-@pytest.mark.parametrize("name", ["noisy-30", "random"])
-def test_interruptions_do_not_change_the_dataset(datasets, name, tmp_path, monkeypatch):
-    root = tmp_path / "stopped"
-    for episodes in (1, 2):
-        with monkeypatch.context() as patch:
-            interrupt_after(patch, episodes)
-            with pytest.raises(KeyboardInterrupt):
-                collect(root, policy=name, num_envs=2)
-    assert tree(collect(root, policy=name, num_envs=3).root) == tree(datasets[name].root)
 
 
 def test_metadata_describe_the_behaviour(datasets):
@@ -150,22 +137,6 @@ def test_wrong_acts_by_skills_of_the_plan(tmp_path):
     assert (actions == rows["unclipped_action"].unsqueeze(1)).all(-1).any(-1).all()
 
 
-@pytest.mark.parametrize(
-    ("was", "now", "message"),
-    [
-        ("expert", "scripted", r"policy.kind \('expert', now 'segments'\), policy.name \('expert', now 'scripted'\)"),
-        ("scripted", "expert", r"policy.name \('scripted', now 'expert'\)"),
-        ("noisy-30", "noisy-60", r"policy.name \('noisy-30', now 'noisy-60'\), policy.right \(0.3, now 0.6\)"),
-    ],
-)
-def test_another_behaviour_is_an_error_with_the_difference(tmp_path, was, now, message):
-    dataset = collect(tmp_path / "demos", tasks="reach", episodes_per_task=1, policy=was)
-    before = tree(dataset.root)
-    with pytest.raises(DatasetError, match=message):
-        collect(dataset.root, tasks="reach", episodes_per_task=1, policy=now)
-    assert tree(dataset.root) == before
-
-
 def test_redrawing_works_with_other_policies(tmp_path, monkeypatch):
     options = dict(tasks="reach", policy="wrong", redraw_failures=True, episodes_per_task=2, max_steps=31)
     dataset = collect(tmp_path / "a", noise_scale=0.0, **options)
@@ -175,34 +146,6 @@ def test_redrawing_works_with_other_policies(tmp_path, monkeypatch):
     monkeypatch.setattr("lw_torchrl.data.collect._MAX_ATTEMPTS", 3)
     with pytest.raises(RuntimeError, match=r"only 0 of 3 .*redraw_failures=False"):
         collect(tmp_path / "c", tasks="push", policy="random", redraw_failures=True, episodes_per_task=1)
-
-
-@pytest.mark.parametrize("label", ["expert", "unclipped"])
-def test_labels_of_the_expert_are_an_error_for_other_policies(datasets, label):
-    with pytest.raises(ValueError, match=f"label='{label}' .* 'random'"):
-        lw.LanguageWorldExperienceReplay(datasets["random"].root, label=label)
-
-
-def test_the_column_behaviour_is_the_labels_rank(datasets):
-    names = ("wrong", "scripted", "random")
-    replay = lw.LanguageWorldExperienceReplay([datasets[name].root for name in names], label="executed")
-    assert replay.behaviours == ("random", "scripted", "wrong")
-    size = datasets["wrong"].num_steps
-    assert replay[:]["behaviour"].tolist() == [2] * size + [1] * size + [0] * size
-
-
-def test_one_label_for_two_behaviours_is_an_error(tmp_path, datasets):
-    first = collect(tmp_path / "one", policy=trained(), behaviour="tiny")
-    second = collect(tmp_path / "other", policy=trained(seed=1), behaviour="tiny")
-    with pytest.raises(ValueError, match="the label 'tiny' stands for different behaviours"):
-        lw.LanguageWorldExperienceReplay([first.root, second.root], label="executed")
-    metadata = json.loads((second.root / "metadata.json").read_text())
-    metadata["config"]["policy"]["name"] = "second"
-    (second.root / "metadata.json").write_text(json.dumps(metadata))
-    both = lw.LanguageWorldExperienceReplay([first.root, second.root], label="executed")
-    assert both.behaviours == ("second", "tiny")
-    alone = collect(tmp_path / "reach", tasks="reach", policy="scripted")  # other plans, the same behaviour
-    lw.LanguageWorldExperienceReplay([datasets["scripted"].root, alone.root], label="executed")
 
 
 def test_a_checkpoint_records_seeds_and_tasks_of_its_demonstrations(tmp_path, datasets, capsys):
@@ -283,52 +226,6 @@ def test_only_the_same_policy_resumes_an_interrupted_collection(tmp_path, monkey
         collect(root, policy=actor, behaviour="other")
     assert tree(root) == before
     assert tree(collect(root, policy=actor, behaviour="tiny").root) == tree(whole.root)
-
-
-class Odd(TensorDictModuleBase):
-    """A policy with a wrong action."""
-
-    def __init__(self, wrong):
-        super().__init__()
-        self.wrong = wrong
-        self.in_keys, self.out_keys = ["observation"], ["deed" if wrong == "key" else "action"]
-
-    def forward(self, tensordict):
-        dtype = torch.float64 if self.wrong == "dtype" else torch.float32
-        action = tensordict["observation"][..., : 3 if self.wrong == "shape" else 4].to(dtype)
-        if self.wrong == "value":
-            action = action * torch.nan
-        return tensordict.set(self.out_keys[0], action)
-
-
-RANDOM = lw.ScriptedSkillActor(PLANS, "random")
-
-
-@pytest.mark.parametrize(
-    ("policy", "options", "error", "message"),
-    [
-        (trained(), dict(behaviour=None), ValueError, "behaviour must be a label for the policy"),
-        (trained(), dict(behaviour="noisy"), ValueError, "'noisy' is reserved"),
-        ("random", dict(behaviour="expert"), ValueError, "'expert' is reserved"),
-        (Behaviour("wrong", right=0.9), dict(behaviour=None), ValueError, "'wrong' is reserved"),
-        (Behaviour("mine", "policy"), {}, ValueError, "pass the policy itself"),
-        ("raondm", {}, ValueError, "policy must be one of 'expert'.*did you mean 'random'"),
-        (lambda state: state, {}, ValueError, "must write 'action'"),
-        (lambda state: state, dict(behaviour=None), ValueError, "behaviour must be a label for the policy"),
-        (trained("description"), dict(tasks=("push", "drawer-open")), ValueError, "tasks must be .* drawer-open"),
-        (Odd("value"), {}, ValueError, "NaN"),
-        (Odd("key"), {}, ValueError, "must write 'action'"),
-        (lambda state: state["observation"], {}, TypeError, "policy must return its input TensorDict"),
-        (Odd("dtype"), {}, ValueError, "must be float32"),
-        (Odd("shape"), {}, ValueError, r"must be float32 of shape \(2, 4\), got torch.float32 of shape \(2, 3\)"),
-        (RANDOM, {}, ValueError, "policy: this ScriptedSkillActor"),
-        (lw.modules.ActorEnsemble([RANDOM]), {}, ValueError, "policy: this ActorEnsemble"),
-    ],
-)
-def test_wrong_policies_are_errors(tmp_path, policy, options, error, message):
-    with pytest.raises(error, match=message):
-        collect(tmp_path / "demos", policy=policy, num_envs=2, **{"behaviour": "mine", **options})
-    assert not (tmp_path / "demos" / "metadata.json").exists()
 
 
 def test_a_module_and_a_function_collect_the_same_rows(tmp_path):

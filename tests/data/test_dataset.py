@@ -1,7 +1,5 @@
 """A dataset on disk: errors for unfinished and damaged ones, files that never change, pickles that never run."""
 
-from __future__ import annotations
-
 import copy
 import json
 import os
@@ -18,7 +16,7 @@ from torchrl.data import SliceSampler
 
 from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.data import dataset as module
-from lw_torchrl.data.dataset import COLUMNS, FORMAT, FORMAT_VERSION, MappedColumn, load_rows, read_metadata
+from lw_torchrl.data.dataset import COLUMNS, FORMAT, FORMAT_VERSION, MappedColumn, load_rows
 
 ALL = [(task, episode) for task in TASKS for episode in range(EPISODES)]
 
@@ -45,23 +43,11 @@ def edit(root, change):
     path.write_text(json.dumps(metadata))
 
 
-def test_metadata_are_read_as_they_were_written(dataset):
-    again = read_metadata(dataset.root)
-    assert again == dataset
-    assert again.attempts == dict.fromkeys(TASKS, EPISODES)
-    assert load_rows(again).batch_size == (len(ALL) * STEPS,)
-
-
 def test_tensordict_reads_the_rows_and_writes_the_same_files(dataset, tmp_path):
     rows = TensorDict.load_memmap(dataset.root / "data")
     assert (rows == load_rows(dataset)).all()
     rows.clone().memmap(tmp_path / "again")
     assert tree(tmp_path / "again") == tree(dataset.root / "data")
-
-
-def test_a_missing_folder_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"root: .*nowhere.*collect_demonstrations"):
-        LanguageWorldExperienceReplay(tmp_path / "nowhere")
 
 
 def test_unfinished_and_other_folders_are_errors(root):

@@ -1,14 +1,11 @@
 """Datasets in LeRobot's and Minari's formats: restored bit for bit, and read by other libraries; pictures as videos."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -158,13 +155,6 @@ def test_damaged_files_are_errors_with_the_path(made, exported, tmp_path, format
     assert all(str(source) in error for error in errors)
 
 
-def test_hidden_files_are_ignored(made, exported, tmp_path):
-    """macOS writes ._NAME beside files on shared disks."""
-    source = shutil.copytree(exported("lerobot"), tmp_path / "copy")
-    (source / "data/chunk-000/._file-000.parquet").write_bytes(b"\0\5\x16\7\0\2\0\0Mac OS X        ")
-    assert tree(lw.import_dataset(source, tmp_path / "again").root) == tree(made.root)
-
-
 def test_other_files_are_errors_with_the_path(made, tmp_path):
     (tmp_path / "notes").mkdir()
     with pytest.raises(ExchangeError, match="notes' is not a LeRobot"):
@@ -178,18 +168,6 @@ def test_other_files_are_errors_with_the_path(made, tmp_path):
     with pytest.raises(ValueError, match="out must be a new folder"):
         lw.export_dataset(made.root, "lerobot", tmp_path)
     assert not (tmp_path / "out").exists()
-
-
-def test_our_own_export_allows_no_options(exported, tmp_path):
-    with pytest.raises(ValueError, match="task must not be given"):
-        lw.import_dataset(exported("lerobot"), tmp_path / "out", task="hammer")
-
-
-def test_a_missing_package_is_an_error_with_its_extra(made, monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "minari", None)
-    with pytest.raises(ImportError, match=r"'lw_torchrl\[minari\]'"):
-        lw.export_dataset(made.root, "minari", tmp_path / "out")
-    assert [*tmp_path.iterdir()] == []
 
 
 def test_a_full_disk_is_an_error_before_minari_writes(made, monkeypatch, tmp_path):
@@ -253,21 +231,6 @@ def test_lerobot_and_torchrl_load_an_export(made, exported, tmp_path):
     assert read["next.reward"] == digest("next", "reward_dense")
     assert read["task"] == [lw.TASKS[info.task].description for info in made.episodes for _ in range(info.length)]
     assert read["success"] == rows["next", "success"].flatten().tolist()
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_torchrl_loads_zeros_for_minari(made, monkeypatch, tmp_path):
-    """A bug of TorchRL that docs/data.md reports: when this fails, the bug is fixed, and the page must change."""
-    pytest.importorskip("minari")
-    from torchrl.data.datasets import MinariExperienceReplay
-
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    lw.export_dataset(made.root, "minari", tmp_path / "minari" / "demos-v0")
-    options = {"root": str(tmp_path / "torchrl"), "load_from_local_minari": True, "download": False}
-    replay = MinariExperienceReplay("demos-v0", batch_size=4, **options)
-    assert replay[:]["observation"].shape == (21, 39)
-    assert not replay[:]["observation"].any()
 
 
 @pytest.mark.slow
@@ -336,12 +299,3 @@ def test_incomplete_pictures_are_left_out(drawn, tmp_path):
     pictures.file(made.root, made.episodes[1]).unlink()
     out = lw.export_dataset(made.root, "lerobot", tmp_path / "out")
     assert not (out / "videos").exists()
-
-
-def test_damaged_pictures_are_errors_with_the_path(drawn, tmp_path):
-    pytest.importorskip("av")
-    made, pictures = drawn
-    pictures.file(made.root, made.episodes[1]).write_bytes(b"no pictures")
-    with pytest.raises(lw.data.DatasetError, match=r"drawer-open\.1\.zip'"):
-        lw.export_dataset(made.root, "lerobot", tmp_path / "out")
-    assert not (tmp_path / "out").exists()

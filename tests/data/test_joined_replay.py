@@ -1,20 +1,15 @@
 """The replay buffer over several datasets and chosen episodes: rows, labels, descriptions."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
 import torch
 from collecting import collect
 
-import lw_torchrl as lw
-from lw_torchrl.data import CoLearningSampler, JoinedDemonstrations, LanguageWorldExperienceReplay
+from lw_torchrl.data import JoinedDemonstrations, LanguageWorldExperienceReplay
 from lw_torchrl.data.dataset import load_rows
-from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 
 STEPS = 50
-PLANS = lw.load_plans("MT10")
 
 
 @pytest.fixture(scope="module")
@@ -99,48 +94,6 @@ def test_episodes_are_chosen_from_one_dataset(base, choice, episodes):
     assert part.success_rate.keys() == set(replay.tasks)
 
 
-def test_one_demonstration_mixes_with_the_base_tasks(base, target):
-    """The paper's one-shot minibatch, where the target is a base task."""
-    replay = LanguageWorldExperienceReplay(
-        [base.root, target.root],
-        episodes=[None, {"reach": [1]}],
-        batch_size=40,
-        sampler=CoLearningSampler("reach"),
-        transform=lw.QAFTransform(PLANS),
-        after_success=20,
-    )
-    demonstration, _ = expected_rows(target, [("reach", 1)], 20)
-    batches = []
-    for _ in range(20):
-        batch = replay.sample()
-        assert batch["task_id"].unique(return_counts=True)[1].tolist() == [10, 10, 20]
-        assert torch.equal(batch["is_target"], batch["task_id"] == lw.task_id("reach"))
-        assert batch["qaf"].shape[0] == 40
-        batches.append(batch[batch["is_target"]])
-    rows = torch.cat(batches)
-    assert rows["episode"].unique().tolist() == [1]
-    assert rows["collector", "traj_ids"].unique().tolist() == [6 + 1]
-    assert torch.equal(rows["observation"].unique(dim=0), demonstration["observation"].unique(dim=0))
-
-
-def test_a_checkpoint_resumes_only_with_the_same_episodes(base, target, tmp_path):
-    def trainer(number):
-        replay = LanguageWorldExperienceReplay(
-            [base.root, target.root],
-            episodes=[None, {"reach": [number]}],
-            sampler=CoLearningSampler("reach"),
-            transform=lw.QAFTransform(PLANS),
-        )
-        config = BehavioralCloningConfig(steps=3, batch_size=8)
-        actor = lw.PlanConditionedActor(PLANS)
-        return BehavioralCloningTrainer(actor, replay, config, checkpoint=tmp_path / "one.safetensors", progress=False)
-
-    assert trainer(1).train() < 2
-    assert trainer(1).steps == 3
-    with pytest.raises(ValueError, match="episodes"):
-        trainer(2)
-
-
 def test_the_description_names_datasets_and_episodes(base, target):
     replay = LanguageWorldExperienceReplay([base.root, str(target.root)], episodes=[1, {"reach": [2, 0]}])
     joined = replay.demonstrations
@@ -151,25 +104,3 @@ def test_the_description_names_datasets_and_episodes(base, target):
     for path in ("data_path_root", "data_path"):
         with pytest.raises(ValueError, match="joins 2 datasets"):
             getattr(replay, path)
-
-
-@pytest.mark.parametrize(
-    ("choice", "message"),
-    [
-        ({"pusj": 1}, r"episodes: task .* did you mean 'push'"),
-        ({"push": 3}, r"episodes\['push'\].* 2 episodes"),
-        ({"push": [0, 7]}, r"episodes\['push'\].* got \[7\]"),
-        ({"push": []}, r"episodes\['push'\]"),
-    ],
-)
-def test_wrong_choices_of_episodes_are_errors(base, choice, message):
-    with pytest.raises(ValueError, match=message):
-        LanguageWorldExperienceReplay(base.root, episodes=choice)
-
-
-def test_several_folders_need_a_list_of_choices(base, target):
-    for episodes in ([None], {"push": 1}, 1):
-        with pytest.raises(ValueError, match="episodes must be a list of 2 choices"):
-            LanguageWorldExperienceReplay([base.root, target.root], episodes=episodes)
-    with pytest.raises(ValueError, match=r"episodes\[1\]: task"):
-        LanguageWorldExperienceReplay([base.root, target.root], episodes=[None, {"push": 1}])

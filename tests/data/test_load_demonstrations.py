@@ -1,18 +1,14 @@
-"""load_demonstrations: rows for TorchRL's own buffers and tools."""
-
-from __future__ import annotations
+"""load_demonstrations: rows for TorchRL's tools."""
 
 import pytest
 import torch
 from collecting import tree
 from tensordict import TensorDict
-from torch.utils.data import DataLoader
 from torchrl.data import (
     LazyTensorStorage,
     OfflineToOnlineReplayBuffer,
     RandomSampler,
     TensorDictReplayBuffer,
-    TensorStorage,
     prefill_replay_buffer,
 )
 from torchrl.envs import TransformedEnv
@@ -49,21 +45,6 @@ def test_several_folders_are_concatenated(roots):
     assert rows["dataset"].bincount().tolist() == [len(part) for part in parts]
     ids = rows["collector", "traj_ids"]
     assert len(ids.unique_consecutive()) == len(ids.unique()) == sum(len(p["episode"].unique()) * 2 for p in parts)
-
-
-def test_rows_work_in_torchrls_own_buffer(roots):
-    rows = lw.load_demonstrations(roots, episodes=[None, {"push": 1}])
-    for sampler in (lw.TaskBalancedSampler(), lw.CoLearningSampler("push")):
-        batch = TensorDictReplayBuffer(storage=TensorStorage(rows), sampler=sampler, batch_size=8).sample()
-        assert batch["task_id"].unique(return_counts=True)[1].tolist() == [4, 4]
-    assert batch["dataset"][batch["is_target"]].unique().tolist() == [1]
-
-
-def test_rows_work_in_a_data_loader(roots):
-    rows = lw.load_demonstrations(roots[0])
-    (batch,) = DataLoader(rows, batch_size=len(rows), shuffle=True, collate_fn=lambda batch: batch)
-    assert torch.equal(batch["observation"].sort(0).values, rows["observation"].sort(0).values)
-    assert len(next(iter(DataLoader(rows, batch_size=4, collate_fn=lambda batch: batch)))) == 4
 
 
 def double(batch):

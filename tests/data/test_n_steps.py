@@ -1,6 +1,4 @@
-"""n_step_returns: TorchRL's own numbers, flags of the same row as the observation, and no step across episodes."""
-
-from __future__ import annotations
+"""n_step_returns: TorchRL's own numbers, and no step across episodes."""
 
 from itertools import pairwise
 
@@ -75,17 +73,6 @@ def test_a_batch_of_a_collector_is_cut_at_its_end(envs, time, n_steps, seed):
     assert (n_step_returns(rows.exclude("collector"), n_steps, 0.9) == ahead.exclude("collector")).all()
 
 
-def test_torchrls_flags_would_bootstrap_from_the_end():
-    """Show why done and terminated follow the observation, and why TorchRL's transform is an error."""
-    rows = make_rows([4])
-    rows["next", "terminated"][-1], rows["next", "truncated"][-1] = True, False
-    torchrls_rows = MultiStep(0.9, 3)(rows.unsqueeze(0))[0]
-    assert torch.equal(torchrls_rows["next", "observation"][1], rows["next", "observation"][3])
-    assert not torchrls_rows["next", "terminated"][1]
-    ahead = n_step_returns(rows, 3, 0.9)
-    assert ahead["next", "terminated"].flatten().tolist() == [False, True, True, True]
-
-
 def test_a_value_estimator_discounts_by_the_steps():
     rows = make_rows([5])
     ahead = n_step_returns(rows, 3, 0.9)
@@ -111,10 +98,3 @@ def test_n_steps_of_a_dataset_end_with_the_episode(root, after):
     check(ahead, torchrls(trajectories(plain), 5, 0.99))
     assert ahead["next", "done"].sum() == 15
     assert torch.equal(ahead["task_id"], ahead["next", "task_id"])
-
-
-def test_n_steps_need_a_discount_and_executed_actions(root):
-    with pytest.raises(ValueError, match="n_steps=3 requires gamma"):
-        LanguageWorldExperienceReplay(root, label="executed", n_steps=3)
-    with pytest.raises(ValueError, match=r"n_steps, .* require label='executed'"):
-        LanguageWorldExperienceReplay(root, n_steps=3, gamma=0.9)

@@ -1,7 +1,5 @@
 """Pictures of datasets: equal to a camera's, lossless, resumed after a kill, and errors for damaged ones."""
 
-from __future__ import annotations
-
 import shutil
 import zipfile
 

@@ -1,7 +1,5 @@
 """LanguageWorldExperienceReplay: rows, labels, rewards, ends of episodes, transforms, columns and its saved state."""
 
-from __future__ import annotations
-
 import functools
 import pickle
 
@@ -82,29 +80,6 @@ def test_a_transform_answers_the_plans_queries(made, label):
         assert torch.equal(batch["next", "qaf"], following)
 
 
-def test_the_generator_fixes_the_batches(made):
-    def batches(seed):
-        generator = torch.Generator().manual_seed(seed)
-        replay = LanguageWorldExperienceReplay(made.root, batch_size=16, generator=generator)
-        return torch.cat([replay.sample()["observation"] for _ in range(3)])
-
-    assert torch.equal(batches(0), batches(0))
-    assert not torch.equal(batches(0), batches(1))
-
-
-def test_a_sampler_that_is_set_later_draws_from_the_generator(made):
-    def drawn(later):
-        generator = torch.Generator().manual_seed(0)
-        replay = LanguageWorldExperienceReplay(
-            made.root, batch_size=16, generator=generator, sampler=None if later else TaskBalancedSampler()
-        )
-        if later:
-            replay.set_sampler(TaskBalancedSampler())
-        return replay.sample()["index"]
-
-    assert torch.equal(drawn(later=True), drawn(later=False))
-
-
 @pytest.mark.parametrize("sampler", [TaskBalancedSampler, lambda: CoLearningSampler("push")])
 def test_prefetching_one_batch_gives_the_same_batches(dataset, sampler):
     def make(prefetch):
@@ -116,28 +91,6 @@ def test_prefetching_one_batch_gives_the_same_batches(dataset, sampler):
     for _ in range(40):
         assert (ahead.sample() == now.sample()).all()
     assert ahead._prefetch_queue
-
-
-def test_prefetching_several_batches_is_an_error(dataset):
-    with pytest.raises(ValueError, match="prefetch must be 0 or 1, got 3"):
-        LanguageWorldExperienceReplay(dataset.root, prefetch=3)
-
-
-def test_torchrls_slice_sampler_finds_the_episodes(made):
-    sampler = SliceSampler(slice_len=10, traj_key=("collector", "traj_ids"))
-    batch = LanguageWorldExperienceReplay(made.root, batch_size=40, sampler=sampler, label="executed").sample()
-    slices = batch.reshape(4, 10)
-    assert (slices["episode"] == slices["episode"][:, :1]).all()
-    assert torch.equal(slices["observation"][:, 1:], slices["next", "observation"][:, :-1])
-
-
-def test_attributes_name_tasks_and_folders(made):
-    replay = LanguageWorldExperienceReplay(made.root, sampler=TaskBalancedSampler(), batch_size=7)
-    assert replay.tasks == ("reach",)
-    assert replay.data_path_root == made.root
-    assert replay.data_path == made.root / "data"
-    assert replay.demonstrations == made
-    assert len(replay.sample()) == 7
 
 
 @pytest.mark.parametrize("make", [lambda: MultiStepTransform(3, 0.9), Reward2GoTransform])
@@ -379,26 +332,6 @@ def test_a_column_does_not_change_batches_and_state(opened, variant):
         batch = again.sample()
         assert torch.equal(batch["index"], index)
         assert torch.equal(batch["advantage"], index.float())
-
-
-def test_a_column_must_have_a_new_name(opened):
-    transform = lw.QAFTransform(PLANS)
-    replay = opened("joined", batch_size=8, sampler=CoLearningSampler("push"), transform=transform)
-    for name in ("qaf", "qaf_plan", "is_target", "is_demonstration", "index", "action", "next", "behaviour"):
-        with pytest.raises(ValueError, match=f"name .*'{name}'"):
-            replay.add_column(name, torch.zeros(len(replay)))
-    replay.add_column("advantage", torch.arange(len(replay)))
-    batch = replay.sample()
-    assert torch.equal(batch["advantage"], batch["index"])
-
-
-@pytest.mark.parametrize("values", [lambda n: torch.zeros(n - 1), lambda n: torch.full((n,), torch.nan)])
-def test_wrong_values_of_a_column_are_errors(opened, values):
-    replay = opened("one")
-    before = replay[:]
-    with pytest.raises(ValueError, match="values"):
-        replay.add_column("a", values(len(replay)))
-    assert (replay[:] == before).all()
 
 
 def test_values_of_other_rows_are_errors(opened, dataset, other_dataset):

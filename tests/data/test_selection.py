@@ -1,7 +1,5 @@
 """Selected episodes against an oracle written by hand, the rows that buffers show of them, and their rewards."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -81,7 +79,7 @@ def oracle(parts, returns, success, least_return, best, behaviours, else_best):
 
 
 @given(joined(), filters)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_filters_keep_what_the_oracle_keeps(described, options):
     parts, returns = described
     labels = {part.config.behaviour for part in parts}
@@ -122,27 +120,6 @@ def shown(replay):
     return [[(e.task, e.episode) for e in part.episodes] for part in parts]
 
 
-@pytest.mark.parametrize("reward", list(REWARDS))
-@pytest.mark.parametrize("ends", [dict(), dict(after_success=3), dict(terminate_on_success=True)])
-def test_returns_are_the_sums_of_the_shown_rows(made, reward, ends):
-    whole = opened(made, "scripted", "random", reward=reward, **ends)
-    rows = whole[:]
-    returns = []
-    for number in range(len(whole.demonstrations.episodes)):
-        rewards = rows["next", "reward"][rows["collector", "traj_ids"] == number]
-        returns.append(sum(rewards.flatten().tolist()))
-    tasks = [e.task for e in whole.demonstrations.episodes]
-    least = min(max(r for r, of in zip(returns, tasks, strict=True) if of == task) for task in TASKS)
-    kept = opened(made, "scripted", "random", reward=reward, keep=EpisodeFilter(least_return=least - 1e-9), **ends)
-    expected = [number for number, total in enumerate(returns) if total >= least - 1e-9]
-    assert len(expected) > 0
-    assert kept[:]["collector", "traj_ids"].unique().tolist() == expected
-    best = opened(made, "scripted", "random", reward=reward, keep=EpisodeFilter(best=0.01), **ends)
-    for task in TASKS:
-        (number,) = [n for n in best[:]["collector", "traj_ids"].unique().tolist() if tasks[n] == task]
-        assert returns[number] >= max(r for r, of in zip(returns, tasks, strict=True) if of == task) - 1e-9
-
-
 def test_returns_are_summed_in_double_precision_over_each_episode():
     reward = torch.tensor([[1.0], [2.0], [4.0], [8.0]])
     assert episode_returns(reward, [1, 3]).tolist() == [[1.0, 1.0], [14.0, 3.0]]
@@ -162,13 +139,6 @@ def test_success_and_behaviours_select_across_parts(made):
     assert all(not e.success for e in failed.demonstrations.episodes)
     alone = opened(made, "scripted", episodes={"reach": 5}, keep=EpisodeFilter(success=True))
     assert shown(alone) == [[(e.task, e.episode) for e in made["scripted"].episodes if e.task == "reach" and e.success]]
-
-
-def test_nothing_left_of_a_task_is_an_error(made):
-    with pytest.raises(ValueError, match=r"keep: .*leaves no episode of push"):
-        opened(made, "random", "scripted", keep=EpisodeFilter(success=True))
-    with pytest.raises(ValueError, match=r"keep: behaviours .* did you mean"):
-        opened(made, "scripted", keep=EpisodeFilter(behaviours=("scribted",)))
 
 
 def test_filters_see_episodes_as_they_are_shown(made):
@@ -256,14 +226,3 @@ def test_rewards_are_those_computed_by_hand(made, name, ends):
         assert float(shown_rows["next", "reward"][row]) == pytest.approx(by_hand(name, dense, success), abs=1e-6)
     assert shown_rows["next", "reward"].dtype == torch.float32
     assert shown_rows["next", "reward"].shape == (len(kept), 1)
-
-
-@pytest.mark.parametrize(("name", "least", "most"), [("cost", -0.01, 0.0), ("dense_cost", -0.1001, 0.0)])
-def test_costs_are_zero_only_at_success(made, name, least, most):
-    rows = opened(made, "scripted", reward=name, terminate_on_success=True)[:]
-    reward, terminated = rows["next", "reward"], rows["next", "terminated"]
-    assert terminated.any()
-    assert (reward[terminated] == 0).all()
-    assert (reward[~terminated] < 0).all()
-    assert reward.min() >= least
-    assert reward.max() <= most

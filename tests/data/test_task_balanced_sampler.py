@@ -1,13 +1,10 @@
 """TaskBalancedSampler: exact counts, no row twice in a pass, and batches that can be repeated."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 from torchrl.data import (
     LazyMemmapStorage,
     LazyStackStorage,
@@ -16,7 +13,6 @@ from torchrl.data import (
     TensorDictReplayBuffer,
 )
 
-from lw_torchrl import LanguageWorldEnv
 from lw_torchrl.data import TaskBalancedSampler
 
 sizes = st.lists(st.integers(1, 9), min_size=1, max_size=5)  # rows of each task
@@ -88,32 +84,6 @@ def test_a_restored_state_gives_the_same_batches(sizes, count, seed, before):
     assert drawn(other, 5) == expected
 
 
-@pytest.mark.parametrize("before", [0, 2])
-def test_the_state_is_saved_to_a_folder(tmp_path, before):
-    rows = make_rows([7, 5, 9])
-    replay = make_replay(rows, 12)
-    drawn(replay, before)
-    replay.sampler.dumps(tmp_path / "sampler")
-    assert not list(tmp_path.rglob("*.pickle"))
-    generator = torch.Generator()
-    generator.set_state(replay._rng.get_state())
-    expected = drawn(replay, 5)
-    other = make_replay(rows, 12, seed=9)
-    other.sampler.loads(tmp_path / "sampler")
-    other.set_rng(generator)
-    assert drawn(other, 5) == expected
-    other.sampler.load_state_dict(other.sampler.state_dict())
-
-
-@pytest.mark.parametrize(
-    ("tasks", "batch_size", "nearest"), [(3, 100, "99 and 102"), (3, 2, "3"), (10, 512, "510 and 520"), (7, 1, "7")]
-)
-def test_with_exact_other_batch_sizes_are_errors_with_the_nearest(tasks, batch_size, nearest):
-    replay = make_replay(make_rows([4] * tasks), batch_size, sampler=TaskBalancedSampler(exact=True))
-    with pytest.raises(ValueError, match=f"batch_size must be a multiple of {tasks}.* {nearest}$"):
-        replay.sample()
-
-
 @settings(max_examples=40, deadline=None)
 @given(sizes, st.lists(st.integers(1, 30), min_size=1, max_size=20), seeds)
 def test_other_batch_sizes_are_rounded_and_totals_stay_equal(sizes, batch_sizes, seed):
@@ -126,12 +96,6 @@ def test_other_batch_sizes_are_rounded_and_totals_stay_equal(sizes, batch_sizes,
     other.load_state_dict(replay.state_dict())
     for size in batch_sizes:
         assert torch.equal(other.sample(size)["row"], replay.sample(size)["row"])
-
-
-def test_single_rows_come_from_each_task_in_turn():
-    replay = make_replay(make_rows([5, 5, 5]), 1)
-    tasks = [replay.sample()["task_id"].item() for _ in range(9)]
-    assert all(sorted(tasks[n : n + 3]) == [3, 5, 7] for n in (0, 3, 6))
 
 
 @pytest.mark.parametrize("tail", [(), (1,), (10,), (2, 3)])
@@ -150,18 +114,6 @@ def test_rows_may_hold_their_task_in_any_shape(tail, kind):
         assert (batch["row"] % 2).bincount().tolist() == [2, 2]
     replay.extend(rows[:2])
     assert len(replay.sample()) == 4
-
-
-def test_a_row_with_several_tasks_is_an_error():
-    replay = make_replay(TensorDict({"task_id": torch.arange(8).view(4, 2)}, [4]), 2)
-    with pytest.raises(ValueError, match="column 'task_id'"):
-        replay.sample()
-
-
-def test_an_empty_storage_is_an_error():
-    replay = make_replay([], 4, capacity=10)
-    with pytest.raises((ValueError, RuntimeError), match="empty"):
-        replay.sample()
 
 
 @settings(max_examples=20, deadline=None)
@@ -239,21 +191,6 @@ def test_every_row_of_a_storage_of_two_dimensions_comes_once(capacity):
     rows = len(storage) // 4
     indices = torch.cat([batch["index"][batch["task_id"] == 3] for batch in batches])[:rows]
     assert len(indices.unique(dim=0)) == rows
-
-
-def test_a_collector_fills_a_storage_of_two_dimensions():
-    env = LanguageWorldEnv(["push", "reach"], num_envs=4, max_steps=10)
-    replay = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(200, ndim=2), sampler=TaskBalancedSampler(), batch_size=20
-    )
-    collector = Collector(
-        env, None, frames_per_batch=40, total_frames=80, auto_register_policy_transforms=False, traj_format="padded"
-    )
-    for rows in collector:
-        replay.extend(rows)
-        batch = replay.sample()
-        assert batch["task_id"].unique(return_counts=True)[1].tolist() == [10, 10]
-    collector.shutdown()
 
 
 @pytest.mark.parametrize("storage", [ListStorage, LazyStackStorage, LazyMemmapStorage])

@@ -1,7 +1,5 @@
 """Training and evaluation on a device that records every wait; test_devices.py runs these tests in another process."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 
@@ -416,9 +414,7 @@ def test_device_names(demos):
 
     for name in ("auto", "pretend", "pretend:0", PRETEND):
         assert check_device("device", name) == PRETEND
-    with pytest.raises(ValueError, match="device must be one of 'cpu', 'pretend', 'pretend:0', 'auto'"):
-        check_device("device", "pretend:1")
-    with pytest.raises(ValueError, match=r"device .*no CUDA"):
+    with pytest.raises(ValueError, match=r"device must be .* got 'cuda'"):
         make_trainer(demos, "cuda")
 
 
@@ -517,7 +513,6 @@ def test_augmentations_are_on_the_rows_device():
     augmented = Compose(
         lw.QAFTransform(plans),
         lw.transforms.SwapUnmentioned(plans, 0.5),
-        lw.transforms.HideOpening(0.5),
         lw.transforms.JitterTarget(plans, 0.03),
         lw.RandomYaw(0.3, plans=plans, tilt=0.5),
     )

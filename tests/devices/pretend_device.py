@@ -4,8 +4,6 @@ Its graphs record operations without executing them, and repeat them on the same
 separate process: PyTorch can register one such device, and never removes it.
 """
 
-from __future__ import annotations
-
 import traceback
 import warnings
 from contextlib import contextmanager, nullcontext

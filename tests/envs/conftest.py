@@ -1,7 +1,5 @@
 """The environment that several test files step, on each engine."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """Six rows of three tasks, and helpers that step them."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from tensordict import TensorDictBase

@@ -1,6 +1,4 @@
-"""Collectors and evaluators with an actor: new weights reach every worker, and resuming continues."""
-
-from __future__ import annotations
+"""Collectors with an actor: new weights reach every worker, and resuming continues."""
 
 import os
 import signal
@@ -13,9 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 from speed import first_fast
-from torchrl.collectors import Collector, Evaluator, MultiAsyncCollector, MultiSyncCollector
-from torchrl.envs import AsyncEnvPool
-from worker_envs import make_actor, make_push_reach, make_single, numbered
+from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
+from worker_envs import make_actor, make_push_reach, numbered
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:No explicit `?device", "ignore:This process .* is multi-threaded, use of fork:DeprecationWarning"
@@ -150,83 +147,3 @@ def test_a_killed_collector_resumes_with_the_next_episodes(kind, tmp_path):
     assert not seen & after
     if kind == "one":  # the episode that had just begun is lost
         assert min(number for _, number in after) == max(number for _, number in seen) + 2
-
-
-@pytest.mark.slow
-def test_a_pool_of_processes_runs_an_actor():
-    pool = AsyncEnvPool(numbered(make_single, 2), backend="multiprocessing", exchange="queue")
-    with torch.no_grad():
-        data = pool.rollout(4, make_actor())
-    pool.close()
-    assert data["action"].shape == (2, 4, 4)
-    assert data["episode"][:, 0].tolist() == [0, 1]
-
-
-@pytest.mark.slow
-def test_ray_gets_new_weights_and_different_episodes():
-    pytest.importorskip("ray")
-    with ray_started():
-        actor = make_actor()
-        collector = make_collector("ray", actor)
-        seen, locs = [], []
-        for batch in collector:
-            seen.append(episodes(batch))
-            locs.append(batch["loc"].abs().sum().item())
-            if len(seen) == 4:
-                break
-            with torch.no_grad():
-                for p in actor.module["decoder"].parameters():
-                    p.zero_()
-            collector.update_policy_weights_()
-        assert len(set().union(*seen)) == sum(map(len, seen)), "no episode may come twice"
-        assert locs[0] > 0
-        assert locs[-1] == 0
-        collector.shutdown()
-
-
-# ---- TorchRL's Evaluator
-
-
-def make_policy(env=None):
-    return make_actor()
-
-
-def summarize(rollout):
-    steps = rollout["next", "reward"].shape[1]
-    return {
-        "episodes": [*zip(rollout["task_id"][:, 0].tolist(), rollout["episode"][:, 0].tolist(), strict=True)],
-        "steps": steps,
-        "moved": rollout["action"].abs().sum().item(),
-    }
-
-
-@pytest.mark.filterwarnings("ignore:Nested TransformedEnvs")  # it wraps the environment
-@pytest.mark.parametrize("backend", ["thread", pytest.param("process", marks=pytest.mark.slow)])
-def test_an_evaluator_runs_whole_episodes_with_the_given_weights(backend):
-    options = {"num_trajectories": 4, "max_steps": 5, "frames_per_batch": 10, "metrics_fn": summarize}
-    actor = make_actor()
-    if backend == "thread":
-        evaluator = Evaluator(
-            make_push_reach(),
-            make_actor(),
-            collector_kwargs={"auto_register_policy_transforms": False, "traj_format": "padded"},
-            **options,
-        )
-    else:
-        options |= {"policy_factory": make_policy, "backend": backend, "collector_kwargs": {"traj_format": "padded"}}
-        evaluator = Evaluator(make_push_reach, **options)
-    first = evaluator.evaluate(actor)
-    with torch.no_grad():
-        for p in actor.parameters():
-            p.zero_()
-    assert evaluator.trigger_eval(actor)
-    second = evaluator.wait(120)
-    evaluator.shutdown()
-    for metrics in (first, second):
-        assert metrics["eval/num_episodes"] == 4
-        assert metrics["eval/steps"] == metrics["eval/episode_length"] == 5
-        assert len({task for task, _ in metrics["eval/episodes"]}) == 2
-        assert len(set(metrics["eval/episodes"])) == 4
-    assert first["eval/moved"] > 0
-    assert second["eval/moved"] == 0
-    assert not set(first["eval/episodes"]) & set(second["eval/episodes"]), "unlike lw.evaluate"

@@ -1,8 +1,4 @@
-"""Custom engines and tasks, the shipped engines by name, and the poses that they report."""
-
-from __future__ import annotations
-
-import warnings
+"""Custom engines and tasks, and the shipped engines by name."""
 
 import numpy as np
 import pytest
@@ -13,10 +9,9 @@ from torchrl.envs import check_env_specs
 
 import lw_torchrl as lw
 from lw_torchrl.envs.episodes import run_episodes
-from lw_torchrl.envs.seeding import action_noise, episode_seed
+from lw_torchrl.envs.rows import action_noise, episode_seed
 from lw_torchrl.suites.engine import EngineStep
-from lw_torchrl.suites.metaworld import ENGINES, MetaWorldEngine, make_engine
-from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
+from lw_torchrl.suites.metaworld import ENGINES, make_engine
 
 STACK = lw.Task("stack-cups", "Stack the cups.", (*lw.TASKS["reach"].objects,))
 STACK_ID = lw.task_id("stack-cups")
@@ -58,15 +53,6 @@ def with_fake(**options) -> tuple[lw.LanguageWorldEnv, FakeEngine]:
     return env, env._engine
 
 
-def test_a_step_without_an_engine_step_is_an_error(monkeypatch):
-    env, engine = with_fake()
-    state = env.reset()
-    monkeypatch.setattr(engine, "step", lambda action, active: tuple(FakeEngine.step(engine, action, active)))
-    with pytest.raises(ValueError, match=r"FakeEngine\.step returned tuple"):
-        advance(env, state, torch.zeros(3, 4))
-    env.close()
-
-
 def test_a_custom_engine_gets_rows_seeds_and_actions():
     env, engine = with_fake(reward="dense", num_threads=2)
     assert engine.tasks == FEW
@@ -94,41 +80,6 @@ def test_a_custom_engine_gets_rows_seeds_and_actions():
     assert engine.closed == 1
 
 
-def test_a_fault_of_an_engine_truncates_only_its_row():
-    env, engine = with_fake()
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="row 1: its simulation became unstable")
-        check_env_specs(env, break_when_any_done="both")
-    env.set_seed(4)
-    state = advance(env, env.reset(), torch.zeros(3, 4))
-    before = state["observation"][1].clone()
-    with pytest.warns(UserWarning, match="row 1: its simulation became unstable"):
-        state = advance(env, state, torch.zeros(3, 4))
-    assert state["fault"].flatten().tolist() == [False, True, False]
-    assert state["truncated"].flatten().tolist() == [False, True, False]
-    assert state["success"].flatten().tolist() == [True, False, True]
-    assert torch.equal(state["observation"][1], before)
-    assert state["observation"][0, 0].item() == np.float32(2 / 3)
-    with pytest.raises(RuntimeError, match=r"rows \[1\]"):
-        advance(env, state, torch.zeros(3, 4))
-    state = env.reset(state.clone().set("_reset", torch.tensor([False, True, False])))
-    state = advance(env, state, torch.zeros(3, 4))
-    assert not state["fault"].any()
-    assert not state["done"].any()
-    assert state["observation"][0, 0].item() == 1.0
-    env.close()
-    assert engine.closed == 1
-
-
-def test_strict_does_not_concern_unstable_simulations():
-    env, _ = with_fake(strict=True)
-    state = advance(env, env.reset(), torch.zeros(3, 4))
-    with pytest.warns(UserWarning, match="row 1: its simulation became unstable"):
-        state = advance(env, state, torch.zeros(3, 4))
-    assert state["fault"].flatten().tolist() == [False, True, False]
-    env.close()
-
-
 def test_rows_with_nan_do_not_reach_the_engine():
     env, engine = with_fake()
     state = env.reset()
@@ -138,9 +89,6 @@ def test_rows_with_nan_do_not_reach_the_engine():
         advance(env, state, action)
     assert engine.steps[-1][1].tolist() == [False, True, True]
     env.close()
-
-
-# ---- tasks that Meta-World lacks
 
 
 @pytest.mark.parametrize("tasks", [["reach", STACK], [STACK, "reach"], (t for t in (STACK, lw.TASKS["reach"]))])
@@ -183,50 +131,8 @@ def test_the_spec_of_metaworlds_tasks_has_fifty_ids():
     env.close()
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_shipped_engines_do_not_accept_custom_tasks(engine):
-    task = lw.Task("push-bck", "Push it back.", (*lw.TASKS["reach"].objects,))
-    with pytest.raises(ValueError, match="did you mean 'push-back'"):
-        make_engine(engine, [task.name])
-
-
-@pytest.mark.parametrize("tasks", ["stack-cups", ["stack-cups"], ["reach", "stack-cups"], [STACK]], ids=str)
-def test_a_custom_task_without_an_engine_is_an_error(tasks):
-    with pytest.raises(ValueError, match=r"'stack-cups'.* engine="):
-        lw.LanguageWorldEnv(tasks)
-
-
-def test_an_unknown_name_is_not_a_custom_task():
-    with pytest.raises(ValueError, match=r"task must be one of .* got 'stack-cups'"):
-        episode_seed("stack-cups", 0, 0)
-
-
 def test_engines_are_made_by_name_or_function():
     assert list(ENGINES) == ["vectorized", "metaworld"]
     assert make_engine(FakeEngine, ["reach"]).tasks == ["reach"]
     with pytest.raises(ValueError, match=r"engine .* did you mean 'vectorized'"):
         make_engine("vectorised", ["reach"])
-
-
-def test_poses_equal_metaworlds():
-    tasks = ["door-open", "door-close"]  # one XML file, whose bodies each reset moves
-    engines = [VectorizedEngine(tasks, num_threads=1), MetaWorldEngine(tasks)]
-    action = np.full((2, 4), 0.3, np.float32)
-    for engine in engines:
-        engine.reset([0, 1], [3, 4])
-        first = engine.poses(0)
-        kept = first.position.copy()
-        for _ in range(3):
-            engine.step(action, np.ones(2, bool))
-        np.testing.assert_array_equal(first.position, kept)
-        assert not np.array_equal(engine.poses(0).position, kept)
-        engine.reset([1], [5])
-    for row in (0, 1):
-        ours, theirs = (engine.poses(row) for engine in engines)
-        np.testing.assert_array_equal(ours.position, theirs.position)
-        np.testing.assert_array_equal(ours.quaternion, theirs.quaternion)
-    ours, theirs = (engine.model(0) for engine in engines)
-    assert ours.path == theirs.path
-    assert ours.model.nbody == theirs.model.nbody
-    for engine in engines:
-        engine.close()

@@ -1,7 +1,5 @@
 """run_episodes: exactly the requested episodes, and the same results on any number of rows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import cache
 
@@ -18,8 +16,8 @@ from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl._util.devices import in_blocks
-from lw_torchrl.envs.episodes import FinishedEpisode, run_episodes
-from lw_torchrl.envs.seeding import action_noise
+from lw_torchrl.envs.episodes import run_episodes
+from lw_torchrl.envs.rows import action_noise
 
 TASKS = ["push", "reach"]
 SEED, STEPS = 3, 8
@@ -160,19 +158,6 @@ def test_the_policy_reads_the_mask_of_active_rows():
     assert [mask.sum().item() for mask in masks] == [3] * STEPS + [1] * STEPS
 
 
-def test_recorded_steps_do_not_change_later():
-    env = plain_env(2)
-    episodes = run_episodes(env, wavy, {"push": [0, 1], "reach": [0]}, keys=["observation", ("next", "success")])
-    with torch.no_grad():
-        first = next(episodes)
-        assert isinstance(first, FinishedEpisode)
-        kept = first.steps.clone()
-        rest = list(episodes)
-    assert same(first.steps, kept)
-    assert set(kept.keys(True, True)) == {"observation", ("next", "success")}
-    assert {(each.task, each.episode) for each in [first, *rest]} == {("push", 0), ("push", 1), ("reach", 0)}
-
-
 def test_an_abandoned_run_does_not_change_the_next_one():
     env = transformed_env(3)
     with torch.no_grad():
@@ -244,20 +229,6 @@ def test_noise_depends_only_on_the_episode(hold):
     assert all(same(steps.exclude("clean"), expected_steps(*key)) for key, steps in quiet.items())
 
 
-def test_noise_leaves_the_clean_action_unclipped():
-    """``clean_action`` holds the policy's action, even out of range."""
-
-    def policy(tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set("action", torch.full((2, 4), 1.5))
-
-    recorded = run(
-        plain_env(2), policy, {"reach": [0]}, noise=lambda _: (0.1,) * 4, clean_action="clean", keys=["clean", "action"]
-    )
-    steps = recorded["reach", 0]
-    assert (steps["clean"] == 1.5).all()
-    assert (steps["action"] <= 1).all()
-
-
 # ---- stopping early
 
 
@@ -299,18 +270,6 @@ def test_stopping_after_success_does_not_change_success(make, after):
 
 
 # ---- errors
-
-
-def test_an_unknown_task_is_an_error():
-    with pytest.raises(ValueError, match=r"episodes: .* drawer-open, sweep"):
-        run(plain_env(2), wavy, {"sweep": [0], "reach": [1], "drawer-open": []})
-
-
-def test_a_nan_is_an_error_in_a_strict_environment():
-    env = lw.LanguageWorldEnv("reach", strict=True)
-    with pytest.raises(ValueError, match="action must hold numbers: row 0"):
-        run(env, lambda td: td.set("action", torch.full((1, 4), float("nan"))), {"reach": [0]})
-    env.close()
 
 
 def test_a_module_may_ask_for_smaller_blocks():

@@ -1,12 +1,9 @@
 """Faults of a row do not change other rows: NaN actions, unstable simulations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
-from rows import ROWS, STEPS, advance, others, row_actions, same, trajectories
-from tensordict import TensorDictBase
+from rows import STEPS, advance, others, row_actions, same, trajectories
 from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
@@ -46,25 +43,6 @@ def test_a_row_with_a_nan_action_is_truncated_and_others_continue(any_env):
             assert torch.equal(state["observation"][row], reference[key]["observation"][now])
             assert torch.equal(state["reward"][row], reference[key]["reward"][now - 1])
     assert state["done"].flatten().tolist() == others(4).tolist()
-
-
-def test_rollouts_continue_after_nan_actions(any_env):
-    any_env.set_seed(2)
-    step = iter(range(100))
-
-    def policy(tensordict: TensorDictBase) -> TensorDictBase:
-        action = torch.zeros(ROWS, 4)
-        if next(step) == 2:
-            action[1:3] = float("nan")
-        return tensordict.set("action", action)
-
-    with pytest.warns(UserWarning, match=r"row 1: its action is NaN.* \(2 rows\)"):
-        rollout = any_env.rollout(8, policy, break_when_any_done=False)
-    ended = torch.zeros(ROWS, 8, dtype=torch.bool)
-    ended[1:3, 2] = True
-    assert torch.equal(rollout["next", "fault"].squeeze(-1), ended)
-    assert torch.equal(rollout["next", "done"].squeeze(-1), ended)
-    assert rollout["episode"][:, 2:4].tolist() == [[0, 0], [0, 2], [0, 2], [1, 1], [1, 1], [1, 1]]
 
 
 def test_strict_raises_an_error_and_moves_nothing(plans):

@@ -1,18 +1,16 @@
-"""render: pictures of the rows and TorchRL's recorder; rendering does not change the simulation."""
+"""render: pictures of the rows; rendering does not change the simulation."""
 
 import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 import torch
 from pictures import why_no_pictures
 from speed import first_fast
-from torchrl.envs import Compose, StepCounter, TransformedEnv, check_env_specs
-from torchrl.record import PixelRenderTransform, VideoRecorder
-from torchrl.record.loggers import CSVLogger
+from torchrl.envs import TransformedEnv
+from torchrl.record import PixelRenderTransform
 
 import lw_torchrl as lw
 from lw_torchrl._util.rendering import CAMERAS
@@ -91,58 +89,6 @@ def test_sizes_may_alternate_and_two_environments_may_render():
     second.close()
 
 
-def test_torchrls_video_recorder_records_a_single_environment(tmp_path):
-    recorder = VideoRecorder(CSVLogger("seen", log_dir=str(tmp_path), video_format="pt"), tag="pixels", skip=1)
-    env = TransformedEnv(
-        lw.LanguageWorldEnv("reach", batch_size=(), max_steps=6),
-        Compose(PixelRenderTransform(height=24, width=32), recorder, StepCounter()),
-    )
-    rollout = env.rollout(6)
-    env.transform.dump()
-    (video,) = (torch.load(path) for path in tmp_path.rglob("*.pt"))
-    frames = torch.cat([rollout["pixels"][:1], rollout["next", "pixels"]])
-    assert torch.equal(video.reshape(-1, 3, 24, 32)[-7:], frames.permute(0, 3, 1, 2))
-    env.close()
-
-
-def test_torchrls_pixel_transform_renders_all_rows():
-    env = TransformedEnv(lw.LanguageWorldEnv(["reach", "push"]), PixelRenderTransform(height=24, width=32))
-    check_env_specs(env)
-    rollout = env.rollout(3)
-    assert rollout["pixels"].shape == (2, 3, 24, 32, 3)
-    assert rollout["next", "pixels"].dtype == torch.uint8
-    assert not torch.equal(rollout["pixels"][0], rollout["pixels"][1])
-    env.close()
-
-
-def test_rendering_before_a_reset_or_after_close_is_an_error():
-    env = lw.LanguageWorldEnv("reach")
-    with pytest.raises(RuntimeError, match="before a reset"):
-        env.render()
-    env.reset()
-    env.close()
-    with pytest.raises(RuntimeError, match="before a reset"):
-        env.render()
-
-
-def test_a_custom_engine_needs_no_render():
-    class Still:
-        def __init__(self, tasks, **_):
-            self.n = len(tasks)
-
-        def reset(self, rows, seeds):
-            return np.zeros((len(rows), 39))
-
-        def close(self):
-            pass
-
-    env = lw.LanguageWorldEnv("reach", engine=Still)
-    env.reset()
-    with pytest.raises(NotImplementedError, match="Still has no method render"):
-        env.render()
-    env.close()
-
-
 _RENDER = """
 import lw_torchrl as lw
 env = lw.LanguageWorldEnv("reach")
@@ -206,14 +152,6 @@ def test_reading_the_spec_first_keeps_pixels_in_one_episode():
 
 
 @pytest.mark.slow
-def test_an_open_environment_ends_without_output():
-    done = subprocess.run(
-        [sys.executable, "-c", _RENDER.replace("env.close()", "")], capture_output=True, text=True, check=True
-    )
-    assert not done.stderr
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("backend", first_fast(["glfw", "disable"]))
 def test_the_error_without_opengl_names_what_to_install(backend):
     environment = {**os.environ, "MUJOCO_GL": backend}
@@ -223,12 +161,3 @@ def test_the_error_without_opengl_names_what_to_install(backend):
     assert f"MUJOCO_GL={backend}" in done.stdout
     assert "MUJOCO_GL=egl" in done.stdout
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.slow
-def test_mujoco_gl_may_be_set_after_mujoco_is_imported():
-    program = "import mujoco, os\nos.environ['MUJOCO_GL'] = 'egl'  # as robosuite does\n" + _RENDER
-    environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
-    assert "camera images need OpenGL" not in done.stdout + done.stderr
-    assert not done.returncode

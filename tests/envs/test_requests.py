@@ -1,11 +1,9 @@
 """Episodes of a reset: the next ones, or those of ``episode=``, never those in a tensordict."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
-from rows import ROWS, STEPS, advance, others, row_actions, same, trajectories
+from rows import ROWS, STEPS, others, same, trajectories
 from tensordict import TensorDict
 from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
@@ -29,20 +27,6 @@ BATCHED = {
     "parallel, no buffers": lambda: ParallelEnv(2, make_env, mp_start_method="fork", use_buffers=False),
     "transformed outside": lambda: TransformedEnv(SerialEnv(2, make_env), StepCounter()),
 }
-
-
-# ---- the next episodes
-
-
-def test_resets_in_a_loop_start_the_next_episodes(any_env):
-    any_env.set_seed(3)
-    state, seen = any_env.reset(), []
-    for _ in range(3):
-        seen.append(state["episode"].tolist())
-        for step in range(2):
-            state = advance(any_env, state, row_actions(state, step))
-        state = any_env.reset(state)
-    assert seen == [[0, 0, 0, 1, 1, 1], [2, 2, 2, 3, 3, 3], [4, 4, 4, 5, 5, 5]]
 
 
 def test_a_rollout_from_a_state_starts_the_next_episodes(any_env):
@@ -73,9 +57,6 @@ def test_batched_environments_start_next_or_requested_episodes(name):
     assert requested["episode"].tolist() == [[5, 5], [8, 9]]
     assert (env.reset(episode=4)["episode"] == 4).all()
     env.close()
-
-
-# ---- requested episodes
 
 
 def test_a_reset_starts_the_requested_episodes(any_env):

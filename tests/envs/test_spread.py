@@ -1,7 +1,5 @@
 """Episodes in worker processes: the same bits for every number of workers, and no process is left after a fault."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -55,7 +53,7 @@ def tree(root):
 
 @given(st.dictionaries(st.sampled_from("abcdef"), st.lists(st.integers(), max_size=150)), st.integers(1, 20))
 def test_parts_hold_each_episode_once_and_are_of_equal_size(episodes, workers):
-    parts, together = split(episodes, workers), {}
+    parts, together = split(episodes, workers, 64), {}
     for part in parts:
         for task, listed in part.items():
             together.setdefault(task, []).extend(listed)
@@ -66,9 +64,9 @@ def test_parts_hold_each_episode_once_and_are_of_equal_size(episodes, workers):
 
 
 def test_parts_hold_few_tasks():
-    parts = split({"a": range(2), "b": range(2), "c": range(4)}, 2)
+    parts = split({"a": range(2), "b": range(2), "c": range(4)}, 2, 64)
     assert parts == [{"a": [0, 1], "b": [0, 1]}, {"c": [0, 1, 2, 3]}]
-    assert [len(part) for part in split(dict.fromkeys("abcdef", range(64)), 3)] == [1] * 6
+    assert [len(part) for part in split(dict.fromkeys("abcdef", range(64)), 3, 64)] == [1] * 6
 
 
 # ---- the same bits
@@ -125,7 +123,7 @@ def where(part, on_steps):
 
 def run_where(workers=None, max_steps=1, run=where, **options):
     steps = []
-    items = list(spread(run, EPISODES, steps.append, workers=workers, max_steps=max_steps, **options))
+    items = list(spread(run, EPISODES, steps.append, workers=workers, max_steps=max_steps, largest=64, **options))
     assert sorted(item[:2] for item in items) == [("push", 0), ("push", 1), ("push", 2), ("reach", 0), ("reach", 1)]
     assert sum(steps) == 35
     return {pid for *_, pid in items}
@@ -139,7 +137,9 @@ def test_little_work_stays_in_this_process(monkeypatch):
 
 def test_a_worker_starts_no_workers():
     def run(part, on_steps):
-        pids = {item[2] for item in spread(where, {"push": range(9)}, print, workers=None, max_steps=100_000)}
+        pids = {
+            item[2] for item in spread(where, {"push": range(9)}, print, workers=None, max_steps=100_000, largest=64)
+        }
         assert pids == {os.getpid()}
         return where(part, on_steps)
 
@@ -253,7 +253,7 @@ def test_an_abandoned_iteration_ends_the_workers(tmp_path):
         time.sleep(1.0 if "reach" in part else 100.0)
         return where(part, on_steps)
 
-    with closing(spread(run, {"reach": [0], "push": [0]}, print, workers=2, max_steps=1)) as items:
+    with closing(spread(run, {"reach": [0], "push": [0]}, print, workers=2, max_steps=1, largest=64)) as items:
         assert next(items)[0] == "reach"
         wait_for(lambda: len(marked(tmp_path)) == 2)
     wait_for(lambda: not any(map(lives, marked(tmp_path))), 10)
@@ -268,7 +268,7 @@ PROGRAM = """
         time.sleep(100)
         return []
 
-    list(spread(run, {"push": range(6)}, print, workers=2, max_steps=1))
+    list(spread(run, {"push": range(6)}, print, workers=2, max_steps=1, largest=64))
 """
 
 

@@ -1,10 +1,6 @@
 """state_dict holds seed and episode counters: an environment that loads it continues with the next episodes."""
 
-from __future__ import annotations
-
-import copy
 import io
-import pickle
 
 import pytest
 import torch
@@ -12,7 +8,7 @@ from speed import first_fast
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
 import lw_torchrl as lw
 
@@ -31,14 +27,13 @@ def make_transformed(seed: int = 5) -> TransformedEnv:
 MAKERS = {
     "plain": make_env,
     "transformed": make_transformed,
-    "EnvState": lambda seed=5: TransformedEnv(make_env(seed), lw.transforms.EnvState()),
     "serial": lambda seed=5: SerialEnv(2, make_transformed, create_env_kwargs={"seed": seed}),
     "outside": lambda seed=5: TransformedEnv(
         SerialEnv(2, make_env, create_env_kwargs={"seed": seed}), lw.QAFTransform(lw.load_plans("MT10"))
     ),
     "parallel": lambda seed=5: TransformedEnv(
         ParallelEnv(2, make_transformed, create_env_kwargs={"seed": seed}, mp_start_method="fork"),
-        lw.transforms.EnvState(),
+        lw.QAFTransform(lw.load_plans("MT10")),
     ),
     "parallel, no buffers": lambda seed=5: ParallelEnv(
         2,
@@ -97,7 +92,7 @@ def policy() -> TensorDictModule:
     return TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
 
 
-@pytest.mark.parametrize("name", ["transformed", "EnvState", "serial", "outside"])
+@pytest.mark.parametrize("name", ["transformed", "serial", "outside"])
 def test_a_resumed_collector_continues_with_the_next_episodes(name):
     def collector() -> Collector:
         return Collector(
@@ -132,24 +127,6 @@ def test_a_collector_continues_after_a_reset():
     collector.shutdown()
 
 
-def test_resets_return_fresh_tensors():
-    env = make_transformed()
-    first, second = env.reset(), env.reset()
-    for key in first.keys(True, True):
-        assert first[key].data_ptr() != second[key].data_ptr(), key
-    env.close()
-
-
-def test_a_collector_of_a_plain_environment_saves_no_state():
-    first = Collector(make_env(), policy(), frames_per_batch=3, total_frames=-1, auto_register_policy_transforms=False)
-    saved = first.state_dict()
-    with pytest.raises(ValueError, match="state_dict is empty"):
-        first.load_state_dict(saved)
-    saved["env_state_dict"] = first.env.state_dict()
-    first.load_state_dict(saved)
-    first.shutdown()
-
-
 @pytest.mark.parametrize(("tasks", "num_envs"), [(TASKS, 4), (["push", "sweep"], 3)])
 def test_a_state_of_other_rows_is_an_error(tasks, num_envs):
     env, foreign = make_env(), lw.LanguageWorldEnv(tasks, num_envs=num_envs, num_threads=1)
@@ -161,24 +138,6 @@ def test_a_state_of_other_rows_is_an_error(tasks, num_envs):
     foreign.close()
 
 
-def test_an_environment_may_be_a_part_of_a_module():
-    class Agent(nn.Module):
-        def __init__(self, env: EnvBase) -> None:
-            super().__init__()
-            self.env, self.layer = env, nn.Linear(2, 2)
-
-    first, second = Agent(make_env()), Agent(make_env(6))
-    first.env.reset()
-    assert set(first.state_dict()) == {"env._extra_state", "layer.weight", "layer.bias"}
-    assert not list(first.env.parameters())
-    second.load_state_dict(first.state_dict())
-    assert (second.env.seed, second.env.reset()["episode"].tolist()) == (5, [2, 1, 3])
-    first.env.load_state_dict({}, strict=False)
-    assert first.env.reset()["episode"].tolist() == [2, 1, 3], "without a state nothing changes"
-    first.env.close()
-    second.env.close()
-
-
 def test_a_transform_of_a_buffer_has_no_environments_state():
     transform = lw.QAFTransform(lw.load_plans("MT10"))
     state = transform.state_dict()
@@ -186,14 +145,4 @@ def test_a_transform_of_a_buffer_has_no_environments_state():
     env = make_transformed()
     with pytest.raises(ValueError, match="lacks episode counters"):
         env.transform[0].load_state_dict(state)
-    env.close()
-
-
-@pytest.mark.parametrize("copier", [copy.copy, copy.deepcopy, pickle.dumps], ids=lambda f: f.__name__)
-@pytest.mark.parametrize("make", [make_env, make_transformed])
-def test_copies_and_pickles_are_errors(copier, make):
-    env = make()
-    if not (copier is copy.copy and make is make_transformed):
-        with pytest.raises(TypeError, match="neither pickled nor copied"):
-            copier(env)
     env.close()

@@ -1,15 +1,10 @@
 """LanguageWorldEnv from step to step: partial resets and steps, the end of an episode, fresh tensors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
-from rows import ENGINES, FEW, ROWS, STATE, STEPS, actions_of, advance, others, row_actions, same, trajectories
-from tensordict import TensorDict, TensorDictBase
-from torchrl.collectors import Collector
-from torchrl.envs import TransformedEnv
-from torchrl.trainers import LogValidationReward
+from rows import ENGINES, ROWS, STATE, STEPS, actions_of, advance, others, row_actions, same, trajectories
+from tensordict import TensorDict
 
 import lw_torchrl as lw
 
@@ -69,27 +64,6 @@ def test_rows_outside_a_step_mask_do_not_move(any_env, shape):
     assert rested > 50
 
 
-def test_an_empty_step_mask_changes_nothing(any_env):
-    any_env.set_seed(0)
-    state = any_env.reset()
-    idle = advance(any_env, state, torch.ones(ROWS, 4), _step=torch.zeros(ROWS, dtype=torch.bool))
-    assert same(state, idle.select(*STATE))
-    moved = advance(any_env, idle, torch.ones(ROWS, 4))
-    any_env.set_seed(0)
-    assert same(moved, advance(any_env, any_env.reset(), torch.ones(ROWS, 4)))
-
-
-def test_an_episode_ends_only_by_truncation(any_env):
-    any_env.set_seed(0)
-    rollout = any_env.rollout(3 * STEPS)
-    assert rollout.batch_size == (ROWS, STEPS)
-    last = torch.arange(STEPS) == STEPS - 1
-    for key in ("done", "truncated"):
-        assert torch.equal(rollout["next", key].squeeze(-1), last.expand(ROWS, -1))
-    assert not rollout["next", "terminated"].any()
-    assert not rollout["next", "fault"].any()
-
-
 @pytest.mark.parametrize(
     ("options", "length"),
     [({}, 500), ({"max_steps": 510}, 510), ({"max_steps": 510, "engine": "metaworld"}, 510)],
@@ -139,30 +113,6 @@ def test_a_closed_environment_must_be_reset_and_continues_with_the_next_episodes
     other.close()
 
 
-def test_torchrl_validates_repeatedly_with_one_environment():
-    """``LogValidationReward`` closes its environment after each validation."""
-    plans = lw.load_plans("MT10")
-    env = TransformedEnv(lw.LanguageWorldEnv("reach", max_steps=5), lw.QAFTransform(plans))
-    hook = LogValidationReward(
-        record_interval=1,
-        record_frames=5,
-        frame_skip=1,
-        policy_exploration=lw.ScriptedSkillActor(plans),
-        environment=env,
-        log_keys=[("next", "reward")],
-    )
-    for _ in range(2):
-        assert set(hook(None)) >= {"r_evaluation"}
-        assert env.base_env.is_closed
-
-
-def test_a_step_before_the_first_reset_is_an_error():
-    env = lw.LanguageWorldEnv(["reach", "push"])
-    with pytest.raises(RuntimeError, match=r"rows \[0, 1\]"):
-        env.step(TensorDict({"action": torch.zeros(2, 4)}, [2]))
-    env.close()
-
-
 def test_rollouts_continue_after_the_end_of_episodes(any_env):
     any_env.set_seed(8)
     steps = 2 * STEPS + 5
@@ -207,30 +157,3 @@ def test_writes_to_a_state_do_not_change_the_environment(env):
         state[key].fill_(1)
     resting = env._step(TensorDict({"action": torch.zeros(ROWS, 4), "_step": torch.zeros(ROWS, dtype=torch.bool)}))
     assert same(kept.select(*STATE), resting)
-
-
-@pytest.mark.parametrize("transformed", [False, True])
-def test_a_collector_collects_the_same_as_a_rollout(plans, transformed):
-    base = lw.LanguageWorldEnv(FEW, num_envs=ROWS, seed=9, max_steps=STEPS)
-    env = TransformedEnv(base, lw.QAFTransform(plans)) if transformed else base
-    policy = row_policy()
-    expected = env.rollout(20, policy, break_when_any_done=False)
-    env.set_seed(9)
-    collector = Collector(env, policy, frames_per_batch=10 * ROWS, total_frames=20 * ROWS)
-    batches = torch.cat(list(collector), -1)
-    collector.shutdown()
-    assert batches.batch_size == (ROWS, 20)
-    for key in ("observation", "action", "episode", ("next", "reward"), ("next", "done")):
-        assert torch.equal(batches[key], expected[key]), key
-    assert batches["next", "done"].sum() == ROWS
-    assert batches["collector", "traj_ids"].unique().numel() == 2 * ROWS
-    assert base.is_closed, "the collector must close its environment"
-
-
-def row_policy():
-    """Return a policy that depends only on the observation."""
-
-    def policy(tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set("action", (tensordict["observation"][:, :4] * 37).sin())
-
-    return policy

@@ -1,26 +1,14 @@
-"""LanguageWorldEnv with TorchRL: frame skip, early ends, a single environment, fake data, on-policy losses."""
-
-from __future__ import annotations
+"""LanguageWorldEnv with TorchRL: frame skip, early ends, a single environment, ids in every shape."""
 
 from functools import partial
 
 import pytest
 import torch
-from tensordict.nn import NormalParamExtractor, TensorDictModule
-from torch import nn
-from torchrl.collectors import Collector
 from torchrl.envs import (
-    ExplorationType,
-    ParallelEnv,
     SerialEnv,
-    StepCounter,
     TransformedEnv,
-    UnsqueezeTransform,
-    set_exploration_type,
 )
 from torchrl.envs.utils import check_env_specs
-from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import ClipPPOLoss
 
 import lw_torchrl as lw
 
@@ -111,52 +99,8 @@ def test_a_single_environment_has_no_dimension_of_rows(options):
 # ---- fake data, on which TorchRL calls policies to find out what they write
 
 
-OTHER_TASKS = ("door-open", "drawer-close", "push")
-
-
 def make_env(tasks=("push", "reach")):
     return TransformedEnv(lw.LanguageWorldEnv(tasks, num_envs=3), lw.QAFTransform(PLANS))
-
-
-MAKERS = {
-    "one": make_env,
-    "counted": lambda: make_env().append_transform(StepCounter()),
-    "serial": lambda: SerialEnv(2, make_env),
-    "serial of different tasks": lambda: SerialEnv(2, [make_env, lambda: make_env(OTHER_TASKS)]),
-    "parallel": lambda: ParallelEnv(2, make_env, mp_start_method="fork"),
-}
-
-
-@pytest.mark.parametrize("name", MAKERS)
-@pytest.mark.parametrize(
-    "policy",
-    [lw.PlanConditionedActor, lw.ScriptedSkillActor, lambda plans: lw.modules.DescriptorConditionedActor(tuple(plans))],
-    ids=["plan", "scripted", "description"],
-)
-@pytest.mark.slow
-def test_a_policy_acts_on_fake_data(name, policy):
-    env = MAKERS[name]()
-    fake = env.fake_tensordict()
-    assert policy(PLANS)(fake)["action"].shape == (*env.batch_size, 4)
-    if name == "one":
-        assert fake["task_id"].tolist() == [lw.task_id(task) for task in ("push", "reach", "push")]
-        assert torch.equal(fake["task_id"], fake["next", "task_id"])
-    check_env_specs(env)
-    env.close()
-
-
-def test_a_transform_may_change_the_shape_of_task_id():
-    """TorchRL's transforms assign a spec's shape; Collector and ParallelEnv act on the fake data."""
-    base = lw.LanguageWorldEnv(["push", "reach"], num_envs=3)
-    env = TransformedEnv(base, UnsqueezeTransform(-1, in_keys=["task_id"], out_keys=["column"]))
-    ids = base.observation_spec["task_id"].zero()
-    assert torch.equal(env.fake_tensordict()["column"], ids.unsqueeze(-1))
-    check_env_specs(env)
-    spec = env.observation_spec["column"]
-    assert torch.equal(spec.expand(2, 3, 1).zero(), ids.reshape(3, 1).expand(2, 3, 1))
-    collector = Collector(env, frames_per_batch=6, total_frames=6, trajs_per_batch=None)
-    assert [batch["column"].shape for batch in collector] == [(3, 2, 1)]
-    collector.shutdown()
 
 
 def test_ids_of_a_spec_keep_their_rows_in_every_shape():
@@ -171,72 +115,3 @@ def test_ids_of_a_spec_keep_their_rows_in_every_shape():
     assert torch.equal(spec.unflatten(0, (3, 1)).zero(), ids.reshape(3, 1))
     assert torch.equal(spec.to("cpu").zero(), ids)
     assert torch.equal(spec.zero((2,)), ids.expand(2, 3))
-
-
-# ---- on-policy learning
-
-
-def make_reach():
-    return lw.LanguageWorldEnv("reach", num_envs=3, seed=0, max_steps=50, num_threads=1)
-
-
-def make_transformed():
-    return TransformedEnv(make_reach(), lw.QAFTransform(PLANS))
-
-
-ENVS = {
-    "plain": make_reach,
-    "transformed": make_transformed,
-    "serial": lambda: SerialEnv(2, make_transformed),
-    "parallel": lambda: ParallelEnv(2, make_transformed, mp_start_method="fork"),
-    "outside": lambda: TransformedEnv(SerialEnv(2, make_reach), lw.QAFTransform(PLANS)),
-}
-
-
-def stochastic_actor(distribution):
-    network = nn.Sequential(nn.Linear(39, 8), NormalParamExtractor())
-    options = {"low": -3.0, "high": 3.0} if distribution == "tanh_normal" else {}
-    return ProbabilisticActor(
-        TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal if distribution == "tanh_normal" else IndependentNormal,
-        distribution_kwargs=options,
-        return_log_prob=True,
-    )
-
-
-def sampled(env, actor):
-    """Return a rollout, and the actions that the policy sampled."""
-    actions = []
-
-    def policy(tensordict):
-        tensordict = actor(tensordict)
-        actions.append(tensordict["action"].clone())
-        return tensordict
-
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        rollout = env.rollout(5, policy)
-    return rollout, torch.stack(actions, -2)
-
-
-@pytest.mark.filterwarnings("ignore:No explicit `?device")
-@pytest.mark.parametrize("distribution", ["normal", "tanh_normal"])
-@pytest.mark.parametrize("name", ENVS)
-def test_before_an_update_the_ratio_is_one(name, distribution):
-    torch.manual_seed(0)
-    env = ENVS[name]()
-    actor = stochastic_actor(distribution)
-    rollout, actions = sampled(env, actor)
-    env.close()
-    assert torch.equal(rollout["action"], actions)
-    outside = actions.abs() > 1
-    assert outside.float().mean() > 0.1, "the test needs actions out of range"
-    assert torch.equal(rollout["next", "executed_action"], actions.clamp(-1, 1))
-    loss = ClipPPOLoss(actor, ValueOperator(nn.Linear(39, 1), in_keys=["observation"]))
-    data = rollout.reshape(-1)
-    data["advantage"] = torch.randn(*data.batch_size, 1)
-    data["value_target"] = torch.randn(*data.batch_size, 1)
-    losses = loss(data)
-    assert losses["clip_fraction"] == 0
-    assert losses["kl_approx"].abs() < 1e-4  # another number of rows rounds differently
-    torch.testing.assert_close(losses["ESS"], torch.tensor(1.0), rtol=1e-5, atol=0)

@@ -1,7 +1,5 @@
 """Numbered workers run the episodes of one environment with all their rows; forked processes and threads."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import sys
@@ -12,8 +10,7 @@ from functools import partial
 import pytest
 import torch
 from speed import first_fast
-from torchrl.collectors import MultiSyncCollector
-from torchrl.envs import AsyncEnvPool, EnvCreator, ParallelEnv, SerialEnv
+from torchrl.envs import ParallelEnv, SerialEnv
 from worker_envs import make_env, make_serial, make_transformed, numbered, still
 
 import lw_torchrl as lw
@@ -57,12 +54,6 @@ def test_workers_in_workers_run_different_episodes():
         env.close()
 
 
-def test_env_creators_may_be_numbered():
-    env = SerialEnv(2, [EnvCreator(make_transformed, {"worker": (w, 2)}) for w in range(2)])
-    assert env.reset()["episode"].tolist() == [[0, 1], [2, 3]]
-    env.close()
-
-
 def test_unnumbered_workers_run_the_same_episodes():
     env = SerialEnv(2, make_env)
     assert env.reset()["episode"].tolist() == [[0, 1], [0, 1]]
@@ -77,31 +68,6 @@ def test_workers_differ_after_set_seed():
     assert torch.equal(env.reset()["observation"], first)
     assert first.flatten(0, 1).unique(dim=0).shape == (4, 39)
     env.close()
-
-
-def collected(kind, makers, **options) -> list[torch.Tensor]:
-    collector = kind(makers, still, frames_per_batch=8 * len(makers), total_frames=16 * len(makers), **options)
-    batches = [torch.stack([b["episode"], b["observation"][..., 36]], -1).flatten(0, -2) for b in collector]
-    collector.shutdown()
-    return batches
-
-
-@pytest.mark.slow
-def test_collecting_processes_differ_and_are_reproducible():
-    makers = numbered(make_env, 2)
-    runs = [collected(MultiSyncCollector, makers, cat_results="stack") for _ in range(2)]
-    assert all(torch.equal(left, right) for left, right in zip(*runs, strict=True))
-    episodes, goals = torch.cat(runs[0]).unbind(-1)
-    assert sorted(episodes.unique().tolist()) == list(range(16))
-    assert goals.unique().numel() == 16
-
-
-@pytest.mark.slow
-def test_a_pool_of_processes_runs_different_episodes():
-    makers = numbered(make_env, 2, num_envs=1)
-    pool = AsyncEnvPool(makers, backend="multiprocessing", exchange="queue")
-    assert pool.reset()["episode"].flatten().tolist() == [0, 1]
-    pool.close()
 
 
 def test_numbered_environments_run_different_episodes():
@@ -120,9 +86,6 @@ def test_each_task_counts_its_own_rows():
     assert env.reset()["episode"].tolist() == [2, 1, 3]
     assert env.reset()["episode"].tolist() == [6, 3, 7]
     env.close()
-
-
-# ---- forked processes
 
 
 def in_a_fork(env, state, action: str, channel) -> None:
@@ -149,23 +112,6 @@ def test_use_in_a_forked_process_is_an_error(make, action):
     child.join()
     assert not env.step(state)["next", "fault"].any()
     env.close()
-
-
-# ---- threads
-
-
-def test_environments_in_threads_give_the_same_rollouts():
-    def rollout(task):
-        env = lw.LanguageWorldEnv(task, seed=3, num_threads=1)
-        steps = env.rollout(20, lw.ExpertActor(task))
-        env.close()
-        return steps
-
-    tasks = ["reach", "push", "reach"]
-    expected = [rollout(task) for task in tasks]
-    with ThreadPoolExecutor(3) as threads:
-        rollouts = list(threads.map(rollout, tasks))
-    assert all((left == right).all() for left, right in zip(expected, rollouts, strict=True))
 
 
 def test_experts_in_threads_do_not_change_pythons_warnings():

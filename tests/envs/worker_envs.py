@@ -1,7 +1,5 @@
 """Factories that worker processes import by name."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch
@@ -34,11 +32,6 @@ def still(tensordict):
 
 def make_push_reach(worker=(0, 1)) -> TransformedEnv:
     env = lw.LanguageWorldEnv(["push", "reach"], num_envs=2, max_steps=5, num_threads=1, worker=worker)
-    return TransformedEnv(env, lw.QAFTransform(lw.load_plans("MT10")))
-
-
-def make_single(**options) -> TransformedEnv:
-    env = make_env(num_envs=1, max_steps=5, batch_size=(), **options)
     return TransformedEnv(env, lw.QAFTransform(lw.load_plans("MT10")))
 
 

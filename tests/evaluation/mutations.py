@@ -1,7 +1,5 @@
 """Mutations of JSON values, for tests of functions that read JSON files."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

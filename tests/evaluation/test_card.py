@@ -1,7 +1,5 @@
 """The shipped policy, model cards, and policies in folders and on a fake Hub."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The figure of success rates, and its confidence intervals."""
 
-from __future__ import annotations
-
 import struct
 import sys
 
@@ -70,16 +68,3 @@ def test_no_window_is_opened_and_no_backend_chosen(monkeypatch):
     monkeypatch.delitem(sys.modules, "matplotlib.pyplot", raising=False)
     plot_success(RESULT)
     assert "matplotlib.pyplot" not in sys.modules
-
-
-def test_without_a_path_no_file_is_written(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    plot_success(RESULT).savefig("mine.png")
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.png"]
-
-
-@pytest.mark.parametrize("name", ["figure.xyz", "figure", "figure.txt"])
-def test_an_unknown_format_is_refused(tmp_path, name):
-    with pytest.raises(ValueError, match="path must end in"):
-        plot_success(RESULT, tmp_path / name)
-    assert not any(tmp_path.iterdir())

@@ -8,9 +8,8 @@ import lw_torchrl as lw
 from benchmarks import planted
 from benchmarks.planted import Altered, Jammed, Sensor, fingers, moved_thing, scaled
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.diagnose.failure import Difference, Misled, WrongMotion
+from lw_torchrl.evaluation.diagnose.failure import Finding
 from lw_torchrl.evaluation.diagnose.reruns import difference
-from lw_torchrl.evaluation.diagnose.sentences import finding_text
 
 TASK, SEED = "drawer-open", 7
 PLANS = lw.Plans({TASK: lw.load_plans("MT10")[TASK]})
@@ -36,7 +35,7 @@ def test_an_episode_that_was_cut_before_its_success_is_not_reproducible():
     assert episode.first_success > 30
     [failure] = attribute_failures([episode._replace(steps=episode.steps[:30])], PLANS, actor=scripted(), **RUN)
     assert (failure.cause, failure.step, failure.counterfactuals) == ("not reproducible", None, {})
-    assert failure.finding == Difference("length", 29, 30, episode.first_success)
+    assert failure.finding == Finding("other length", {"at": 29, "given": 30, "again": episode.first_success})
     assert failure.succeeds_at == episode.first_success
     assert f"the rollout has 30 steps, the re-run {episode.first_success}" in failure.why
     assert failure.shares["nothing"] == 1.0
@@ -46,7 +45,7 @@ def test_an_episode_that_was_cut_before_its_success_is_not_reproducible():
 def test_a_failure_by_another_environment_or_noise_is_not_reproducible(options):
     [failure] = attribute_failures(run(scripted(), **options), PLANS, actor=scripted(), **RUN)
     assert failure.cause == "not reproducible"
-    assert (failure.finding.part, failure.finding.at) == ("actions", 0)
+    assert (failure.finding.kind, failure.finding.values["at"]) == ("other actions", 0)
     assert failure.mended is None
 
 
@@ -58,14 +57,15 @@ def rollout(states, actions):
 def test_the_first_difference_between_two_runs_is_found():
     again = rollout([0.0, 1.0, 2.0], [0.5, 0.5, 0.5])
     assert difference(again, again) is None
-    assert difference(again[:2], again) == Difference("length", 1, 2, 3)
-    assert difference(rollout([0.0, 1.0, 3.0], [0.5, 0.5, 0.5]), again) == Difference("environment", 2, size=1.0)
+    assert difference(again[:2], again) == Finding("other length", {"at": 1, "given": 2, "again": 3})
+    environment = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.5, 0.5]), again)
+    assert environment == Finding("other states", {"at": 2, "before": 1, "size": 1.0})
     actions = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.2, 0.5]), again)
-    assert (actions.part, actions.at, actions.size) == ("actions", 1, pytest.approx(0.3))
-    assert "the executed actions, from step 1 on, by 0.3 at that step" in finding_text(actions)
+    assert (actions.kind, actions.values) == ("other actions", {"at": 1, "size": pytest.approx(0.3)})
+    assert "the executed actions, from step 1 on, by 0.3 at that step" in actions.text
     states = difference(rollout([0.0, 3.0], [0.5, 0.5]).exclude("action"), again)
-    assert states == Difference("states", 1)
-    assert "holds no actions" in finding_text(states)
+    assert states == Finding("unknown actions", {"at": 1})
+    assert "holds no actions" in states.text
 
 
 @pytest.mark.parametrize("inside", [True, False])
@@ -76,8 +76,8 @@ def test_a_wrong_observation_is_found(inside):
     [failure] = attribute_failures(episodes, PLANS, actor=actor, evaluator=evaluator, **RUN)
     assert failure.cause == "perception"
     assert failure.counterfactuals["perception"] is True
-    assert isinstance(failure.finding, Misled)
-    assert failure.finding.error == pytest.approx(0.1, abs=1e-3)
+    assert failure.finding.kind == "wrong observation"
+    assert failure.finding.values["error"] == pytest.approx(0.1, abs=1e-3)
     assert "was off by up to 0.1" in failure.why
     assert failure.mended.by == "perception"
     assert not any(module._forward_pre_hooks for module in actor.modules()), "no hook stays on the policy"
@@ -111,7 +111,7 @@ def test_a_wrapper_that_is_a_function_is_seen():
     episodes = run(mirrored, plans=PLANS)
     [failure] = attribute_failures(episodes, PLANS, actor=mirrored, **RUN)
     assert (failure.cause, failure.replaced) == ("actuation", "wrapper")
-    assert (failure.finding.right, failure.finding.shape) == ("decided", "scaled")
+    assert (failure.finding.kind, failure.finding.values["shape"]) == ("wrapped action", "scaled")
 
 
 def test_a_simulator_that_executes_other_actions_is_found():
@@ -120,8 +120,7 @@ def test_a_simulator_that_executes_other_actions_is_found():
         run(scripted(), evaluator=simulator), PLANS, actor=scripted(), evaluator=simulator, **RUN
     )
     assert (failure.cause, failure.replaced) == ("actuation", "wrapper")
-    assert isinstance(failure.finding, WrongMotion)
-    assert failure.finding.right == "commanded"
+    assert failure.finding.kind == "executed action"
 
 
 @pytest.mark.parametrize("told", [False, True])
@@ -132,7 +131,7 @@ def test_other_physics_is_found(told):
     assert failure.cause == "environment differs"
     assert failure.replaced == ("environment" if told else None)
     if not told:
-        assert failure.finding.part == "environment"
+        assert failure.finding.kind == "other first state"
 
 
 def test_a_first_state_of_another_seed_is_another_environment():
@@ -161,4 +160,4 @@ def test_a_failure_of_a_policy_without_plans_has_no_step():
     assert failure.cause in ("actuation", "policy")
     assert failure.step is None
     assert "skill" not in failure.counterfactuals
-    assert failure.finding is None or isinstance(failure.finding, WrongMotion), "a finding without a plan step"
+    assert failure.finding is None or "step" not in failure.finding.values

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.plan_use import PlanUse, expert_use, where_stuck
+from lw_torchrl.evaluation.plan_use import PlanUse, expert_use
 
 PLANS = {"reach": lw.load_plans("MT10")["reach"]}  # three steps
 
@@ -55,26 +55,8 @@ def test_true_conditions_count_where_no_step_is_chosen():
     assert reach.to_json()["states"] == 3
 
 
-def test_an_episode_is_stuck_in_the_most_frequent_late_step():
-    active = torch.nn.functional.one_hot(torch.tensor([0] * 60 + [2] * 6 + [1] * 3 + [0] * 31), 4)
-    assert where_stuck(active, 100) == (0, 2)
-    assert where_stuck(active, 40) == (0, 2)
-    assert where_stuck(active, 34) == (0, 0), "step 1 was active for less than 5 states"
-    assert where_stuck(active * 0, 100) == (0, 0)
-
-
 def test_experts_stop_after_the_states_that_count():
     tasks, plans = ["drawer-open", "reach"], lw.load_plans("MT10")
-    whole = PlanUse(plans)
-    lw.evaluate(
-        lw.ExpertActor(tasks),
-        tasks=tasks,
-        plans=plans,
-        episodes_per_task=2,
-        seed=4,
-        max_steps=250,
-        noise_scale=0.0,
-        also_record=["qaf"],
-        on_episode=whole,
-    )
+    whole, options = PlanUse(plans), {"seed": 4, "max_steps": 250, "noise_scale": 0.0, "also_record": ["qaf"]}
+    lw.evaluate(lw.ExpertActor(tasks), tasks=tasks, plans=plans, episodes_per_task=2, on_episode=whole, **options)
     assert expert_use(plans, tasks, episodes_per_task=2, seed=4) == whole.tasks()

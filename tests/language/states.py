@@ -49,7 +49,7 @@ def random_states(task, seed=0, n=RANDOM):
 def real_states(task, n=REAL):
     """Every second state of one of Meta-World's episodes, float32, the expert acting with noise."""
     policies = pytest.importorskip("metaworld.policies").ENV_POLICY_MAP
-    from lw_torchrl.suites.metaworld.plain_engine import make_metaworld_env
+    from lw_torchrl.suites.metaworld.environments import make_metaworld_env
 
     rng = np.random.default_rng(task_id(task))
     env, expert = make_metaworld_env(task), policies[f"{task}-v3"]()

@@ -16,6 +16,7 @@ from lw_torchrl.language.canonical import (
     explain_canonical,
     fallback_plan,
 )
+from lw_torchrl.language.coverage import coverage_of
 from lw_torchrl.language.objects import GOAL, GRIPPER, NamedObject
 from lw_torchrl.language.plan_files import parse_plan
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
@@ -136,8 +137,38 @@ def test_a_plan_that_misses_states_is_completed():
     assert [role.verb for role in roles] == ["approach", "descend", "close", "carry"]
     assert [role.target for role in roles] == ["mug rim"] * 3 + [GOAL]
     assert [(note["written"], note["seen"]) for note in report.notes()] == [
-        *((step[1], False) for step in steps), (None, True), (None, True), (None, True), (steps[1][1], True)
+        *((step[1], False) for step in steps), (steps[0][1], True), (None, True), (None, True), (steps[1][1], True)
     ]  # fmt: skip
+
+
+def test_a_completed_plan_keeps_its_own_conditions_as_far_as_they_are_right():
+    steps = [
+        ("the gripper is not vertically aligned with the mug", "hover over the mug"),
+        ("the gripper is above the mug", "descend to the mug"),  # also at the mug
+        ("the gripper is near the mug and the gripper is closed", "bring the mug to the goal"),  # not if it is wide
+    ]
+    plan = canonical_plan(plan_of("coffee-pull", *steps))
+    rim = "the robot's gripper is {} the mug rim".format
+    assert [(role.written, role.verb) for role in roles_of(plan)] == [
+        (steps[0][1], "approach"), (steps[1][1], "descend"), ("", "close"), (steps[2][1], "carry")
+    ]  # fmt: skip
+    approach, descend, _, carry = (str(step.condition) for step in plan.steps)
+    assert approach.startswith(f"{rim('not vertically aligned with')} or {rim('not above')}")
+    assert descend == f"{rim('above')} and {rim('not near')}"
+    assert carry.startswith(f"{rim('near')} and the robot's gripper is closed or ")
+
+
+@given(st.sampled_from(sorted(OWN)), st.lists(st.integers(0, 5), min_size=1, max_size=4), st.booleans())
+def test_a_completed_plan_is_complete_wherever_the_hand_is(task, numbers, is_short):
+    own = OWN[task].steps
+    steps = [own[number % len(own)] for number in numbers]
+    report = explain_canonical(
+        plan_of(
+            task, *((str(step.condition.clauses[-1] if is_short else step.condition), step.skill) for step in steps)
+        )
+    )
+    if report.source == "completed":
+        assert coverage_of(report.plan.definition, report.plan.steps) >= canonical.MIN_COVERAGE
 
 
 def test_a_plan_without_a_motion_becomes_the_fallback_plan():

@@ -163,5 +163,5 @@ def test_unused_nodes_are_freed() -> None:
 
 
 def test_wide_expressions_are_refused() -> None:
-    with pytest.raises(ValueError, match="at most 1000 others"):
+    with pytest.raises(ValueError, match="at most 1000 parts"):
         any_of(map(str, range(1_001)))

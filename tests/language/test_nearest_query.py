@@ -84,7 +84,7 @@ def test_a_misspelt_query_matches_the_query_that_is_meant(data, task):
         ("Is the puck at the target location?", "push", "the puck is near the target location"),
         ("the gripper's open but not abov the puck", "push",
          "the robot's gripper is open and the robot's gripper is not above the puck"),
-        ("the puck is near the gripper and above the target", "push",
+        ("the puck is near the gripper and above the targt", "push",
          "the puck is near the robot's gripper and the puck is above the target location"),
     ],
 )  # fmt: skip

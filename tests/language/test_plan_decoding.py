@@ -72,12 +72,15 @@ def test_a_step_has_its_written_words_and_how_they_were_read():
     assert "green cheese" in dropped.dropped
 
 
-def test_thoughts_without_an_answer_are_not_a_plan():
+@pytest.mark.parametrize("tag", ["<think>", "<|begin_of_thought|>", "<|START_THINKING|>"])
+def test_thoughts_without_an_answer_are_not_a_plan(tag):
     draft = lw.encode_plan(lw.load_plans("MT10")["push"], "chain_py")
-    found = lw.decode_plan(f"Well.\n<think>\n{draft}", "push", "chain_py")
+    found = lw.decode_plan(f"Well.\n{tag}\n{draft}", "push", "chain_py")
     assert found.plan is None
     assert "no steps" in found.reason
-    assert [str(note) for note in found.notes][1:] == ["line 2: a thought is left out, and cut off there"]
+    assert [str(note) for note in found.notes][1:] == [
+        "line 2: the model's reasoning is left out (there is no end tag)"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -101,8 +104,46 @@ def test_thoughts_of_many_models(before, after):
     draft, final = (lw.encode_plan(lw.ConditionalPlan("push", plans["push"].steps[:n]), "chain_py") for n in (3, 2))
     found = lw.decode_plan(f"{before.format(draft)}{final}{after.format(draft)}", "push", "chain_py")
     assert found.plan.steps == plans["push"].steps[:2]
-    assert "a thought is left out" in str(found.notes[0])
+    assert "the model's reasoning is left out" in str(found.notes[0])
     assert after or found.steps[0].line > before.count("\n") + draft.count("\n")
+
+
+DRAFT, RULE = "If the gripper is above the puck, lift the puck.", "If the gripper is near the puck, close the gripper."
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"A bad plan: {DRAFT}\n{RULE}",
+        f"✗ {DRAFT}\n✓ {RULE}",
+        f"Incorrect:\n- {DRAFT}\n\nMy plan:\n- {RULE}",
+        f"> {DRAFT}\n\n{RULE}",
+        f"<s>{DRAFT}</s>\n{RULE}",
+        f"```diff\n- {DRAFT}\n+ {RULE}\n```",
+        f"First version:\n```\n{DRAFT}\n```\nAnswer:\n```\n{RULE}\n```",
+        f"```\n{DRAFT}\n```\nThis was wrong.\n```\n{RULE}\n```",
+    ],
+)
+def test_drafts_are_left_out_by_name(text):
+    decoded = lw.decode_plan(text, "push")
+    assert [step.skill for step in decoded.plan.steps] == ["close the gripper"]
+    assert "lift the puck" in " ".join(map(str, decoded.notes))
+
+
+@pytest.mark.parametrize("text", [f"> {RULE}", f"For example:\n```\n{RULE}\n```"])
+def test_an_answer_that_is_only_a_draft_is_read(text):
+    assert [step.skill for step in lw.decode_plan(text, "push").plan.steps] == ["close the gripper"]
+
+
+def test_items_of_a_list_in_html_are_rules():
+    decoded = lw.decode_plan(f"<ul><li>{DRAFT}<li>{RULE}</ul>", "push")
+    assert [step.skill for step in decoded.plan.steps] == ["lift the puck", "close the gripper"]
+
+
+def test_a_second_condition_is_not_part_of_the_skill():
+    decoded = lw.decode_plan(f"- When the gripper is open, if the sun shines, wave the hand.\n- {RULE}", "push")
+    assert [step.skill for step in decoded.plan.steps] == ["close the gripper"]
+    assert "sun" in " ".join(map(str, decoded.notes))
 
 
 @pytest.mark.parametrize("tag", ["</think>", "# </think>", "# <think>", "# done </think>", "# [/THINK]"])
@@ -329,3 +370,29 @@ def test_steps_beyond_the_limit_are_left_out():
     found = lw.decode_plan("if check('gripper open'):\n robot.a()\n" * 1_500, "push", "basic_py")
     assert len(found.plan.steps) == len(found.steps) == 1_000
     assert "line 2001: the plan has more than 1000 steps; 500 are left out" in map(str, found.notes)
+
+
+WRAPPED = """
+- If the gripper is not above the puck and the
+gripper is open, then place the gripper above the
+puck.
+- Recite a poem about robots.
+- Never, if the gripper is open, lift the puck.
+- When the gripper is near the puck, close the gripper.
+"""
+
+
+def test_wrapped_lines_are_joined_and_lines_without_a_rule_are_named():
+    decoded = lw.decode_plan(WRAPPED, "push")
+    assert [step.skill for step in decoded.plan.steps] == ["place the gripper above the puck", "close the gripper"]
+    notes = "\n".join(map(str, decoded.notes))
+    assert "Recite a poem about robots" in notes
+    assert "lift the puck" in notes
+
+
+@pytest.mark.parametrize("key", ["never", "do_not", "avoid"])
+def test_actions_under_keys_that_forbid_are_left_out_by_name(key):
+    text = json.dumps({"rules": [{"when": "gripper open", "do": "close the gripper"}, {key: "lift the puck"}]})
+    decoded = lw.decode_plan(text, "push")
+    assert [step.skill for step in decoded.plan.steps] == ["close the gripper"]
+    assert "lift the puck" in "\n".join(map(str, decoded.notes))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from plan_texts import DRAWER, HEAD, conditional_plans, plan
 
 from lw_torchrl.language import plan_files
-from lw_torchrl.language.nearest import nearest_query
+from lw_torchrl.language.nearest import LIMIT, nearest_query
 from lw_torchrl.language.plan_files import PLAN_LIMIT, check_plan, load_plans, parse_plan, save_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep
 from lw_torchrl.language.queries import check_query, parse_query
@@ -300,7 +300,7 @@ def test_a_missing_path_or_an_empty_folder_is_an_error(tmp_path):
     ("names", "message"),
     [
         (["reach.plan"], r"^reach\.plan, line 1: .*'reach'.*'push'"),
-        (["mine.plan", "push.plan"], r"^push\.plan: a second plan for 'push'; mine\.plan"),
+        (["mine.plan", "push.plan"], r"^push\.plan: 'push' already has a plan in mine\.plan"),
     ],
 )
 def test_a_file_of_another_task_and_a_second_plan_are_refused(tmp_path, names, message):
@@ -368,11 +368,16 @@ def test_pairs_become_plans_and_plan_files(write, tmp_path, value):
 
 
 @given(condition=st.text(max_size=60), skill=st.from_regex(r"[a-z]{1,8}( [a-z]{1,8}){0,3}", fullmatch=True))
-def test_any_condition_of_a_pair_becomes_the_nearest_query(tmp_path_factory, condition, skill):
+def test_a_condition_of_a_pair_becomes_the_nearest_query_or_is_refused(tmp_path_factory, condition, skill):
     path = tmp_path_factory.mktemp("any") / "plans.json"
     path.write_text(json.dumps({"push": [[condition, skill]]}))
+    match = nearest_query(condition, "push")
+    if match.least_score < 1.0 - LIMIT:
+        with pytest.raises(PlanError, match="no query is near enough to the condition"):
+            load_plans(path)
+        return
     (step,) = load_plans(path)["push"].steps
-    assert step.condition == nearest_query(condition, "push").query
+    assert step.condition == match.query
 
 
 @pytest.mark.parametrize(

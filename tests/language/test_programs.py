@@ -286,6 +286,22 @@ READ = {
             ("the robot's gripper is not above the puck", "move to above the puck"),
         ],
     ),
+    "pass, and names that stand for other words": (
+        """
+        NAMES = {"beside": "near"}
+
+        def related(relation):
+            return check(f"the gripper is {NAMES.get(relation, relation)} the puck")
+
+        def push(robot):
+            pass if related("beside") else robot.move("the gripper to the puck")
+            robot.lift("the puck") if related("above") else None
+        """,
+        [
+            ("the robot's gripper is not near the puck", "move the gripper to puck"),
+            ("the robot's gripper is above the puck", "lift puck"),
+        ],
+    ),
     "constants, tables and distances": (
         """
         PLACE = "target location"
@@ -491,6 +507,24 @@ def test_programs_as_models_write_them(name):
         assert skill.replace("the ", "").lower() == words.replace("the ", "")
 
 
+NEGATIONS = {
+    "the gripper isn't near or above the puck": "the gripper is not near the puck and not above the puck",
+    "the gripper is above the puck and neither open nor near it": "gripper above puck and not open and not near puck",
+    "it is (not) near the puck": "the gripper is not near the puck",
+    "the gripper is near the puck (but not closed)": "the gripper is near the puck and not closed",
+    "you don't have the puck": "the gripper is not around the puck",
+    "the puck isn't held": "the gripper is not around the puck",
+    "near the puck, not open, and not above it": "the gripper is near the puck and not open and not above the puck",
+    "the gripper is not (near the puck or above it)": "the gripper is not near the puck and not above the puck",
+}
+
+
+@pytest.mark.parametrize("text", NEGATIONS)
+def test_conditions_in_prose_keep_their_negations(text):
+    plan = lw.decode_plan(f"Stop if {text}. Otherwise, push the puck.", "push").plan
+    assert plan.steps[0].condition == parse_query(NEGATIONS[text], "push")
+
+
 def test_what_cannot_be_expressed_is_left_out_by_name():
     text = """
 def push(robot):
@@ -529,7 +563,7 @@ def test_two_subjects_may_share_a_predicate():
 
 def test_yaml_without_pyyaml_gives_a_note(monkeypatch):
     monkeypatch.setitem(sys.modules, "yaml", None)
-    decoded = lw.decode_plan("rules:\n  - if: gripper open\n    then: wave at the puck\n", "push")
+    decoded = lw.decode_plan("selector:\n  children:\n    - wave at the puck\n", "push")
     assert any("pip install pyyaml" in str(note) for note in decoded.notes)
 
 

@@ -17,7 +17,7 @@ from states import all_tasks, observation, random_states
 from tensordict import TensorDict
 
 from lw_torchrl.language import query_program
-from lw_torchrl.language.expressions import all_of, any_of, negate
+from lw_torchrl.language.expressions import FALSE, TRUE, all_of, any_of, negate
 from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import Query, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram, find_kernel
@@ -435,3 +435,9 @@ def test_vmap_agrees_with_the_batch():
     given = states[:50].clone().requires_grad_()
     program.logits(given, ids[:50]).sum().backward()
     assert torch.equal(slopes, given.grad)
+
+
+@pytest.mark.parametrize("constant", [TRUE, FALSE])
+def test_a_constant_query_is_answered(constant):
+    program = QueryProgram({"push": [Query(constant)]})
+    assert program(torch.zeros(2, 39), torch.full((2,), task_id("push"))).tolist() == [[constant == TRUE]] * 2

@@ -12,9 +12,9 @@ from test_canonical import GRASP, HELD, OWN, G, meanings, plan_of
 
 import lw_torchrl as lw
 from lw_torchrl.language.canonical import canonical_plan, explain_canonical
-from lw_torchrl.language.objects import NamedObject
+from lw_torchrl.language.objects import GOAL, NamedObject
 from lw_torchrl.language.plans import ConditionalPlan
-from lw_torchrl.language.roles import mark_objects, simplify
+from lw_torchrl.language.roles import ignored_words, mark_objects, simplify
 from lw_torchrl.language.step_parser import parse_steps
 
 PARAPHRASES = json.loads((Path(__file__).parent / "sayings.json").read_text("utf-8"))
@@ -67,6 +67,34 @@ def test_the_words_of_shipped_plans_are_known(skills):
             assert simplify(marked) == marked
 
 
+@pytest.mark.parametrize("skills", ["own", "MT10"])
+def test_shipped_plans_have_no_ignored_words(skills):
+    for task, plan in lw.load_plans("MT50", skills=skills).items():
+        assert not any(ignored_words(step.skill, lw.TASKS[task]) for step in plan.steps)
+
+
+@given(
+    st.sampled_from(sorted(OWN)),
+    st.sampled_from(["four times", "twice", "like crazy", "until midnight"]),
+    st.data(),
+)
+def test_words_that_no_step_can_express_are_named_and_change_no_role(task, words, data):
+    plan = OWN[task]
+    step = data.draw(st.sampled_from(plan.steps))
+    pairs = [(each.condition, f"{each.skill} {words}" if each is step else each.skill) for each in plan.steps]
+    changed = ConditionalPlan.from_pairs(plan.definition, pairs)
+    report = explain_canonical(changed)
+    assert meanings(report.plan) == meanings(canonical_plan(plan))
+    assert any(words.split()[-1] in row.get("ignored", "") for row in report.notes())
+
+
+@pytest.mark.parametrize(
+    ("text", "verb"), [("cloes the gripper", "close"), ("shovve the mug", "shove"), ("liftt it", "lift")]
+)
+def test_a_misspelt_verb_is_corrected(text, verb):
+    assert mark_objects(text, lw.TASKS["coffee-push"]).startswith(f"{verb} ")
+
+
 @pytest.mark.slow
 def test_nine_of_ten_paraphrases_have_the_same_meaning():
     same, unread = [], 0
@@ -101,11 +129,76 @@ NEAR_HANDLE = "gripper near the drawer handle"
             [(NEAR_HANDLE, "grab the handle and yank it back"), (f"{NEAR_HANDLE} and gripper closed", "pull it back")],
             ("drawer handle", "move"),
         ),
+        # What a motion starts from is not its target or its direction.
+        ("stick-pull", [GRASP, (HELD, "slip the stick out of the thermos")], ("stick", "move", "stick", "up")),
+        (
+            "bin-picking",
+            [("gripper is open", "bring the cube from this bin into the other bin")],
+            ("cube", "carry", "other bin"),
+        ),
+        ("coffee-pull", [("gripper is open", "take the mug away from the machine")], ("mug", "carry", GOAL, None)),
+        # A handle is pressed down and pulled up.
+        *(
+            ("handle-press-side", [("gripper is open", text)], (G, "push", "handle", "down"))
+            for text in (
+                "drag the handle downwards",
+                "pull down on the handle",
+                "lower the handle",
+                "depress the lever",
+            )
+        ),
+        ("handle-pull-side", [("gripper is open", "pull up on the handle")], (G, "pull", "handle", "up")),
+        ("stick-pull", [GRASP, (HELD, "lower the stick handle")], ("stick handle",)),
+        # An obstacle is on the way.
+        *(
+            ("button-press-wall", [("gripper not near the button", text)], (G, verb, "button"))
+            for text, verb in (
+                ("move the gripper to the button past the wall", "approach"),
+                ("come down behind the wall beside the button", "beside"),
+            )
+        ),
+        *(
+            ("push-wall", [("gripper near the puck and puck is mostly below the wall", text)], ("puck", "carry", GOAL))
+            for text in (
+                "lift it over the wall",
+                "carry the puck past the wall",
+                "lift the puck until it clears the wall",
+            )
+        ),
+        # Words for opening the gripper.
+        *(
+            ("push", [("gripper is near the puck", text)], (G, "open", "puck"))
+            for text in ("release the hold", "set the puck free", "let the puck go", "let go")
+        ),
+        # A gripper that turns or pushes does so with an object, in a plan without another motion.
+        ("dial-turn", [("gripper near the dial", "turn the gripper to the left")], (G, "push", "dial", "left")),
+        ("button-press", [("gripper near the button", "push the hand into the button")], (G, "push", "button", "goal")),
+        ("assembly", [("gripper near the wrench", "wrap the wrench around the peg")], ("wrench", "carry", "peg")),
     ],
 )
 def test_the_meaning_of_the_last_step(task, steps, last):
     *_, step = parse_steps(plan_of(task, *steps))
     assert (step.moved, step.verb, step.target, step.direction)[: len(last)] == last
+
+
+@pytest.mark.parametrize("text", ["go over the wall", "move the gripper around the wall", "cross over the wall"])
+def test_the_way_over_an_obstacle_leads_to_the_point_behind_it(text):
+    steps = [("gripper is not behind the wall and gripper is not forward aligned with the button", text)]
+    steps.append(("gripper is behind the wall and gripper is not near the button", "come down in front of the button"))
+    steps += [("gripper is forward aligned with the button", "push it in"), ("gripper is open", "push the wall away")]
+    report = explain_canonical(plan_of("button-press-wall", *steps))
+    assert (report.source, report.left_out) == ("plan", ("push the wall away",))
+    roles = [(step.role.verb, step.role.target) for step in report.plan.steps]
+    assert roles == [("approach", "button center"), ("beside", "button center"), ("push", "button center")]
+
+
+@pytest.mark.parametrize(
+    ("task", "skill"),
+    [("door-lock", "unlock the door"), ("door-unlock", "lock the door"), ("drawer-close", "unshut it")],
+)
+def test_a_step_that_undoes_the_task_has_no_meaning(task, skill):
+    plan = ConditionalPlan.from_pairs(task, [("gripper is open", skill)])
+    assert parse_steps(plan) == (None,)
 
 
 def test_an_object_may_be_called_hand():

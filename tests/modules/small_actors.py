@@ -1,7 +1,5 @@
 """Small actors of every kind, and rows that they read."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
@@ -40,19 +38,11 @@ def make_role_actor(plans=CANONICAL, seed=0, **options):
     return make_actor(plans, seed, features=m.RoleFeatures(plans), **options)
 
 
-def make_action_mixer(plans=PLANS):
-    parts = m.PlanAttention(plans), m.ObservationFeatures(), m.ActionMixer(plans, small_decoder())
-    actor = TensorDictSequential(*parts)
-    actor(make_rows(1, plans=plans))  # the decoder is lazy
-    return actor
-
-
 ACTORS = {
     "plan": make_actor,
     "focus": lambda: make_actor(features=m.Concat(m.ObservationFeatures(), m.FocusFeatures(PLANS))),
     "roles": make_role_actor,
     "fallback": lambda: make_role_actor(FALLBACK),
-    "mixed actions": make_action_mixer,
     "tanh_normal": lambda: make_actor().stochastic(),
     "normal": lambda: make_descriptor().stochastic("normal"),
     "description": make_descriptor,

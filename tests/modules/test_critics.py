@@ -1,7 +1,5 @@
 """Critics: values of states and of actions on the trunks of policies."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from small_actors import PLANS, letters, make_actor, make_rows
@@ -42,13 +40,6 @@ def test_the_value_of_an_action_depends_on_the_action():
     assert critic.in_keys == ["qaf", "task_id", "observation", "action"]
     other = rows.clone().set("action", -rows["action"])
     assert not torch.equal(critic(rows)["state_action_value"], critic(other)["state_action_value"])
-
-
-def test_quantiles_exclude_an_ensemble():
-    critic = lw.PlanConditionedQValue(PLANS, quantiles=5, **SMALL)
-    assert critic(rows_of(4))["state_action_value"].shape == (4, 5)
-    with pytest.raises(ValueError, match="ensemble"):
-        lw.PlanConditionedQValue(PLANS, quantiles=5, ensemble=2)
 
 
 def test_a_trunk_is_shared_with_the_actor():

@@ -1,17 +1,12 @@
 """Decoders: MLPDecoder, GaussianDecoder, and Decode, which makes any network a part of an actor."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_actors import PLANS, make_actor, make_rows
 from tensordict import TensorDict
 from torch import nn
-from torchrl.modules import ProbabilisticActor, TanhNormal
 
-import lw_torchrl as lw
 from lw_torchrl.modules import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.decoder import LEAST_STD
 from lw_torchrl.modules.parts import materialize
@@ -73,13 +68,3 @@ def test_any_network_becomes_a_part():
     assert torch.equal(part(rows["skill_latent"], rows["features"]), expected), "called with tensors of one shape"
     with pytest.raises(ValueError, match="out_keys"):
         Decode(net, out_keys=["features"])
-
-
-def test_torchrls_probabilistic_actor_draws_from_a_gaussian_decoder():
-    decoder = GaussianDecoder(width=8, depth=1, init_std=0.2)
-    trunk = make_actor(decoder=decoder, out_keys=["loc", "scale"])
-    policy = ProbabilisticActor(trunk, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True)
-    rows = policy(make_rows(5))
-    assert rows["action"].abs().max() < 1
-    torch.testing.assert_close(policy.get_dist(rows.copy()).log_prob(rows["action"]), rows["action_log_prob"])
-    assert lw.modules.plans_of(policy) is PLANS

@@ -1,16 +1,13 @@
 """DescriptorConditionedActor: conditioned on the task's description and on nothing else of the task."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from small_actors import action_of, letters, make_descriptor, make_rows
 from tensordict import TensorDict
 
-import lw_torchrl as lw
 from lw_torchrl.language.tasks import MT50, TASKS, task_id
 from lw_torchrl.language.text import encode_texts
-from lw_torchrl.modules import ObservationFeatures, TaskLatent
+from lw_torchrl.modules import ObservationFeatures
 
 
 def state(*shape, seed=0):
@@ -55,14 +52,6 @@ def test_weights_do_not_depend_on_the_known_tasks():
     assert torch.equal(action_of(one, rows), action_of(other, rows))
     with pytest.raises(ValueError, match=r"task_id.*: push"):
         one(rows.set("task_id", torch.full((3,), task_id("push"))))
-
-
-def test_task_latent_alone():
-    latent = TaskLatent("MT10", in_keys=[("words", "task")], out_keys=["c"])
-    rows = TensorDict({("words", "task"): state(4)["task_id"]}, [4])
-    assert latent(rows)["c"].shape == (4, latent.latent_size)
-    own = lw.Task("touch", "Touch the puck.", TASKS["push"].objects)
-    assert TaskLatent([own]).tasks == ("touch",)
 
 
 @pytest.mark.parametrize("rows", [1, 4])

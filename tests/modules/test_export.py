@@ -1,7 +1,5 @@
 """Deployment: queries and actor as one graph, compiled or exported, of any number of rows."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

@@ -1,7 +1,5 @@
 """ObservationFeatures and Concat: the differences by hand, and statistics that are part of the module."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -107,32 +105,6 @@ def test_noise_is_added_only_in_training_mode():
     assert torch.equal(ObservationFeatures("raw").train()(observation), observation)
 
 
-@pytest.mark.parametrize(
-    "observation", [torch.zeros(2, 38), torch.zeros(()), torch.zeros(2, 39, dtype=torch.int64)], ids=str
-)
-def test_wrong_observations_are_refused(observation):
-    with pytest.raises(ValueError, match="observation must be float32"):
-        ObservationFeatures()(observation)
-
-
-@pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf])
-@pytest.mark.parametrize("kind", ["raw", "differences", "relative", "both"])
-@pytest.mark.parametrize("call", ["forward", "fit"])
-def test_observations_that_are_not_finite_are_refused(wrong, kind, call):
-    observation = random_observation(3)
-    observation[1, 4] = wrong
-    features = ObservationFeatures(kind)
-    with pytest.raises(ValueError, match="observation must hold finite numbers"):
-        fit(features, observation) if call == "fit" else features(observation)
-    assert features.mean.isfinite().all()
-
-
-def test_fitting_to_no_rows_is_refused():
-    for kind in ("differences", "none"):
-        with pytest.raises(ValueError, match="rows"):
-            fit(ObservationFeatures(kind), random_observation(0))
-
-
 def test_weights_count_as_copies_of_rows():
     observation = random_observation(6)
     copies = torch.tensor([1, 2, 1, 3, 1, 0])
@@ -154,9 +126,6 @@ def test_only_features_with_the_same_meaning_transfer_to_another_layout():
     assert features.with_plans(plans) is features
     with pytest.raises(ValueError, match="transfer"):
         ObservationFeatures("raw").with_plans(fetch)
-
-
-# ---- Concat
 
 
 def test_concatenated_features_keep_their_noise():

@@ -1,18 +1,16 @@
-"""SkillMixer and ActionMixer: one latent for each different skill, mixed by attention."""
-
-from __future__ import annotations
+"""SkillMixer: one latent for each different skill, mixed by attention."""
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_actors import CANONICAL, PLANS, letters, make_action_mixer, make_rows, small_decoder
+from small_actors import PLANS, letters, make_rows
 from torch import nn
 
 import lw_torchrl as lw
 from lw_torchrl.language.roles import role_vectors
 from lw_torchrl.language.text import encode_texts
-from lw_torchrl.modules import ActionMixer, PlanAttention, SkillEncoder, SkillMixer
+from lw_torchrl.modules import PlanAttention, SkillEncoder, SkillMixer
 
 
 def weighted(*shape, plans=PLANS, seed=0):
@@ -74,32 +72,3 @@ def test_text_encoder_is_called_once_for_the_different_skills():
     assert calls == [PLANS.skills]
     assert (mixer.vectors.dtype, mixer.vectors.shape[1]) == (torch.float32, 5)
     torch.testing.assert_close(mixer.vectors.square().mean(-1), torch.ones(len(PLANS.skills)))
-
-
-@pytest.mark.parametrize("shape", [(3, 5), (5,), ()])
-def test_wrong_number_of_text_vectors_is_refused(shape):
-    with pytest.raises(ValueError, match="text_encoder"):
-        SkillMixer(PLANS, text_encoder=lambda texts: torch.zeros(shape))
-
-
-def test_mixed_actions_by_hand():
-    torch.manual_seed(0)
-    mixer = ActionMixer(PLANS, small_decoder(), SkillEncoder(3))
-    rows = weighted(5).set("features", torch.rand(5, 4))
-    output = mixer(rows.clone())["action"]
-    latents = mixer.latents()
-    for row in range(5):
-        at = mixer.tables.index.row(lw.MT50[rows["task_id"][row]])
-        each = torch.cat((latents[mixer.index[at]], rows["features"][row].expand(PLANS.num_steps, -1)), -1)
-        torch.testing.assert_close(output[row], rows["skill_weights"][row] @ mixer.decoder(each))
-
-
-@pytest.mark.parametrize("plans", [PLANS, CANONICAL], ids=["text", "roles"])
-def test_mixed_actions_train_every_weight_and_follow_other_plans(plans):
-    actor = make_action_mixer(plans)
-    actor(make_rows(64, plans=plans))["action"].square().sum().backward()
-    assert all(parameter.grad.abs().sum() > 0 for parameter in actor.parameters())
-    mine = lw.canonical_plans({"push": PLANS["push"]}) if plans is CANONICAL else {"push": PLANS["push"]}
-    other = lw.modules.with_plans(actor, mine)
-    assert {id(one) for one in other.parameters()} == {id(one) for one in actor.parameters()}
-    assert other(make_rows(2, plans=other[0].plans))["action"].shape == (2, 4)

@@ -1,13 +1,9 @@
 """Truth of other plans than the actor's, of the same number of steps, is refused wherever both meet."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import ParallelEnv, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl.language.relations import RELATIONS, Comparison
@@ -75,44 +71,6 @@ def test_each_row_carries_the_number_of_its_plan():
     other = lw.ConditionalPlan.from_pairs("reach", [("the gripper is closed", "close the gripper")] * 2)
     with pytest.raises(ValueError, match="for reach; pass"):
         lw.PlanConditionedActor(plans_of(STEPS, other))(mixed)
-
-
-def test_refusal_in_a_collector_and_on_a_replay_buffer():
-    actor, other = lw.PlanConditionedActor(PLANS), OTHERS["another skill"]
-
-    def env():
-        return TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(other))
-
-    with pytest.raises(ValueError, match=REFUSED):
-        next(iter(Collector(env, actor, frames_per_batch=4, total_frames=8, auto_register_policy_transforms=True)))
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(3), transform=lw.QAFTransform(other), batch_size=3)
-    replay.extend(state(PLANS).set(("next", "observation"), torch.ones(3, 39)))
-    sample = replay.sample()  # answers of its own plans replace the stored ones, and say so
-    with pytest.raises(ValueError, match=REFUSED):
-        actor(sample)
-    assert torch.equal(sample["next", "qaf_plan"], sample["qaf_plan"])
-
-
-def test_refusal_across_processes():
-    def make():
-        return TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(PLANS))
-
-    env = ParallelEnv(2, make, mp_start_method="fork")
-    lw.PlanConditionedActor(PLANS)(env.reset())
-    with pytest.raises(ValueError, match=REFUSED):
-        lw.PlanConditionedActor(OTHERS["another skill"])(env.reset())
-    env.close()
-
-
-@pytest.mark.parametrize("make", ["actor", "scripted"])
-def test_refusal_with_renamed_qaf(make):
-    truth, more = ("agent", "truth"), ("observation", "task_id")
-    keys = [truth, *more[::-1]] if make == "actor" else [*more, truth]
-    data = TensorDict(observation=torch.zeros(3, 39), task_id=torch.full((3,), lw.task_id("push"))).auto_batch_size_()
-    transform = lw.QAFTransform(OTHERS["another skill"], out_keys=[truth])
-    assert transform.out_keys == [truth, ("agent", "truth_plan")]
-    with pytest.raises(ValueError, match=REFUSED):
-        ACTORS[make](PLANS, in_keys=keys)(transform(data))
 
 
 def test_refusal_after_a_relation_was_redefined(monkeypatch):

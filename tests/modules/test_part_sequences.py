@@ -1,9 +1,5 @@
 """Sequences of parts: renamed keys, the plans of all parts, and modules that are shared."""
 
-from __future__ import annotations
-
-from collections import OrderedDict
-
 import pytest
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -14,7 +10,6 @@ from lw_torchrl.modules import (
     ActorEnsemble,
     Concat,
     FocusFeatures,
-    PlanAttention,
     SkillMixer,
     Value,
     describe,
@@ -93,29 +88,6 @@ def test_with_plans_keeps_dtype_and_modes():
     assert not actor.decoder.training
     observation = torch.zeros(2, 39, dtype=torch.float64)
     assert other(**{**inputs(), "observation": observation})[-1].dtype == torch.float64
-
-
-def test_part_must_write_what_later_parts_read():
-    actor = lw.PlanConditionedActor(PLANS)
-    with pytest.raises(ValueError, match="features"):
-        actor.features = TensorDictModule(nn.Linear(39, 56), ["observation"], ["seen"])
-    with pytest.raises(ValueError, match="trunk"):
-        Value(TensorDictSequential(PlanAttention(PLANS), SkillMixer(PLANS)))
-
-
-@pytest.mark.parametrize(
-    "network",
-    [
-        nn.Sequential(nn.Linear(120, 8), nn.LayerNorm(8, eps=0.1), nn.GELU(approximate="tanh"), nn.Linear(8, 4)),
-        nn.Sequential(nn.Linear(120, 8), nn.LayerNorm(8, elementwise_affine=False), nn.Linear(8, 4)),
-        nn.Sequential(OrderedDict(a=nn.Linear(120, 4), b=(tanh := nn.Tanh()), c=nn.Linear(4, 4), d=tanh)),
-    ],
-)
-def test_description_of_pytorch_layers_keeps_their_arguments(network):
-    actor = lw.PlanConditionedActor(PLANS, decoder=network).eval()
-    again = from_description(describe(actor))
-    again.load_state_dict(actor.state_dict())
-    assert torch.equal(again.eval()(**inputs())[-1], actor(**inputs())[-1])
 
 
 def test_description_holds_a_setting_that_was_changed_later():

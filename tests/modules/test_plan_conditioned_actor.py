@@ -1,27 +1,16 @@
-"""PlanConditionedActor: keys of its parts, mixing by hand, replaced parts, shared weights, learning."""
-
-from __future__ import annotations
-
-import warnings
+"""PlanConditionedActor: keys of its parts, mixing by hand, replaced parts, shared weights."""
 
 import pytest
 import torch
 from small_actors import PLANS, action_of, letters, make_actor, make_role_actor, make_rows, rows_for
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.text import encode_texts
-from lw_torchrl.modules import Decode, ObservationFeatures, PlanAttention, SkillMixer
-
-
-def make_loss(actor):
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
-        return BCLoss(actor, loss_function="l2")
+from lw_torchrl.modules import Decode, ObservationFeatures
 
 
 @pytest.mark.parametrize("kind", ["raw", "differences", "relative", "both"])
@@ -42,18 +31,6 @@ def test_documented_keys_for_any_leading_shape(kind, shape):
     assert out["action"].abs().max() < 1
     torch.testing.assert_close(out["skill_weights"].sum(-1), torch.ones(shape))
     assert (out.select(*actor.in_keys) == rows).all()
-
-
-def test_parts_can_be_called_alone():
-    actor, rows = make_actor(), make_rows(5)
-    kinds = [type(part) for part in actor.module.values()]
-    assert kinds == [PlanAttention, SkillMixer, ObservationFeatures, Decode]
-    assert isinstance(actor, TensorDictSequential)
-    step_by_step = rows.copy()
-    for part in (actor.attention, actor.mixer, actor.features, actor.decoder):
-        part(step_by_step)
-    assert (step_by_step == actor(rows.copy())).all()
-    assert torch.equal(actor.trunk(rows.copy())["skill_latent"], step_by_step["skill_latent"])
 
 
 def test_action_by_hand():
@@ -87,9 +64,6 @@ def test_canonical_plans_and_the_refusal_of_others():
         actor(written)
 
 
-# ---- replaced parts
-
-
 def test_assigned_part_is_used():
     actor, rows = make_actor(), make_rows(5)
     actor.decoder = net = nn.Sequential(nn.LazyLinear(4), nn.Tanh())
@@ -105,16 +79,6 @@ def test_assigned_part_is_used():
     assert actor.in_keys == ["qaf", "task_id", "hand"]
     with pytest.raises(TypeError, match="decoder"):
         actor.decoder = 3
-
-
-def test_decoder_with_other_out_keys():
-    class Two(nn.Module):
-        def forward(self, encoding):
-            return encoding[..., :4], encoding[..., 4:8].exp()
-
-    actor = make_actor(decoder=Two(), out_keys=["loc", ("d", "scale")])
-    assert actor.out_keys[-2:] == ["loc", ("d", "scale")]
-    assert (actor(make_rows(3))["d", "scale"] > 0).all()
 
 
 def test_assigned_in_keys():
@@ -134,9 +98,6 @@ def test_assigned_in_keys():
         actor.in_keys = ["observation"]
 
 
-# ---- other plans
-
-
 def other_plans():
     pairs = [
         ("the gripper is open", "move the gripper to the reach target"),
@@ -153,40 +114,3 @@ def test_with_plans_keeps_statistics_and_mode(training):
     assert (other.mixer.text_encoder, other.training) == (letters, training)
     other.features.fit(make_rows(50, seed=1))
     assert torch.equal(other.features.mean, actor.features.mean)
-
-
-def test_state_dict_holds_no_tables_of_the_plans():
-    actor = make_actor(text_encoder=letters)
-    assert actor.state_dict().keys() == actor.with_plans(other_plans()).state_dict().keys()
-    parts = {name.rsplit(".", 2)[0].removeprefix("module.") for name in actor.state_dict()}
-    assert parts == {"mixer.encoder", "module", "decoder.network"}
-    assert {name for name in actor.state_dict() if "features" in name} == {
-        "module.features.mean",
-        "module.features.std",
-    }
-
-
-# ---- learning
-
-
-def make_batch(rows=64, seed=0):
-    state = make_rows(rows, seed=seed)
-    target = torch.stack((state["observation"][:, 0], state["qaf"][:, 0].float(), -state["observation"][:, 5]), -1)
-    return state.set("action", torch.cat((target, target[:, :1] * 0), -1) * 0.8)
-
-
-def test_bc_loss_trains_the_actor_itself():
-    actor = make_actor()
-    loss, batch = make_loss(actor), make_batch()
-    optimizer = torch.optim.Adam(loss.parameters(), 1e-2)
-    values = []
-    for _ in range(60):
-        value = loss(batch.clone())["loss_bc"]
-        optimizer.zero_grad()
-        value.backward()
-        optimizer.step()
-        values.append(value.item())
-    assert values[-1] < 0.2 * values[0]
-    with torch.no_grad():
-        error = (actor(batch.exclude("action"))["action"] - batch["action"]).square()
-    assert error.mean() < 0.1, "the actor itself has learned, not a copy"

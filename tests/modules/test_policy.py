@@ -1,9 +1,5 @@
 """plans_of, tasks_of, layout_of, transform_of and with_plans on every kind of actor."""
 
-from __future__ import annotations
-
-from dataclasses import replace
-
 import pytest
 import torch
 from small_actors import ACTORS, CANONICAL, FALLBACK, PLANS, make_actor, make_descriptor, make_role_actor, make_rows
@@ -82,36 +78,3 @@ def test_actors_that_cannot_follow_other_plans_are_refused():
         with_plans(mine, PLANS)
     sequence = with_plans(TensorDictSequential(PLAIN, make_actor()), {"push": PLANS["push"]})
     assert sequence[0] is PLAIN
-
-
-def test_policy_without_progress_reaches_its_fallback_steps():
-    actor, turns = make_role_actor(FALLBACK), []
-    nn.init.zeros_([*actor.decoder.parameters()][-1])
-    lw.evaluate(
-        actor,
-        tasks="reach",
-        episodes_per_task=1,
-        seed=1_000,
-        also_record=["turn"],
-        on_episode=lambda episode: turns.append(episode.steps["turn"].max()),
-        progress=False,
-    )
-    assert max(turns) >= 1
-
-
-@pytest.mark.parametrize("turn", [0, 5])
-def test_each_turn_acts_as_an_actor_of_only_that_plan(turn):
-    """Turn 0 uses the plan's own steps, turn 5 the fallback's with its second motion."""
-
-    def second(plan):
-        steps = [step for step in plan.steps if step.role.fallback]
-        first = next((step for step in steps if step.role.verb in ("carry", "move")), None)
-        rest = [replace(step, role=replace(step.role, fallback=False)) for step in steps if step is not first]
-        return replace(plan, steps=tuple(rest))
-
-    actor = make_role_actor(FALLBACK)
-    alone = lw.Plans([second(plan) for plan in FALLBACK.values()]) if turn else CANONICAL
-    other = actor.with_plans(alone)
-    rows = make_rows(40, plans=PLANS, answered=False)
-    output = actor(transform_of(actor)(rows.copy()).set("turn", torch.full((40,), turn)))["action"]
-    torch.testing.assert_close(output, other(transform_of(other)(rows.copy()))["action"])

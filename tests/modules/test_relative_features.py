@@ -1,7 +1,5 @@
 """FocusFeatures and RoleFeatures: relative positions by hand, contacts from demonstrations, turned scenes."""
 
-from __future__ import annotations
-
 import pickle
 from copy import deepcopy
 
@@ -9,18 +7,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_actors import CANONICAL, PLANS, make_actor, make_role_actor, rows_for
+from small_actors import CANONICAL, make_role_actor
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.objectives import TD3Loss
 
 import lw_torchrl as lw
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules import (
     ActorEnsemble,
-    Concat,
     FocusFeatures,
-    ObservationFeatures,
     PlanAttention,
     RoleFeatures,
     transform_of,
@@ -108,17 +103,6 @@ def test_any_leading_shape_and_noise_in_training_mode(kind):
     assert not torch.equal(features.train()(rows.copy())["features"], once)
 
 
-def test_actor_sees_the_positions_of_its_own_plans():
-    own = Plans([PLANS["push"], PLANS["reach"]])
-    actor = make_actor(own, features=Concat(ObservationFeatures(), FocusFeatures(own)))
-    other = actor.with_plans(PLANS)
-    for each in (actor, other):
-        output = each(rows_for(each, 4))
-        assert (output["features"].shape, output["action"].shape) == ((4, 56 + 18), (4, 4))
-    assert other.decoder is actor.decoder
-    assert other.features.parts[1].plans == PLANS
-
-
 # ---- RoleFeatures
 
 
@@ -145,11 +129,6 @@ def written(roles, seen, **more):
 def rows_of(plans, seen):
     ids = torch.tensor([lw.task_id(task) for task in RoleFeatures(plans).tables.index.tasks])[seen[2]]
     return TensorDict(observation=seen[0], task_id=ids, batch_size=[len(ids)])
-
-
-def test_plans_without_roles_are_refused():
-    with pytest.raises(ValueError, match="plans must have roles"):
-        RoleFeatures(PLANS)
 
 
 @pytest.mark.parametrize(
@@ -368,38 +347,3 @@ def test_actors_with_the_same_weights_share_contacts_whichever_is_fitted():
         assert not other.features.fitted
         fit_normalization(other, replay)
         assert torch.equal(other.features.contact, contact)
-
-
-@pytest.mark.filterwarnings("ignore:No target network updater")
-def test_contacts_fitted_in_a_loss_or_loaded_are_shared():
-    actor, replay, row = make_role_actor(), make_replay(), row_of(ZERO_SHOT, "drawer-open")
-    wider = actor.with_plans(ZERO_SHOT).features
-    critic = lw.PlanConditionedQValue(ZERO_SHOT, features=actor.with_plans(ZERO_SHOT).features, width=8, depth=1)
-    fit_normalization(TD3Loss(actor, critic, bounds=(-1.0, 1.0)), replay)
-    contact = actor.features.contact[row_of(CANONICAL, "drawer-open")]
-    assert contact.any()
-    assert torch.equal(wider.contact[row], contact)
-    other = make_role_actor()
-    wider = other.with_plans(ZERO_SHOT).features
-    other.load_state_dict(actor.state_dict())
-    assert wider.fitted
-    assert torch.equal(wider.contact[row], contact)
-
-
-@pytest.mark.parametrize("features", [FocusFeatures(CANONICAL), RoleFeatures(CANONICAL)])
-def test_wrong_observations_are_refused(features):
-    weights, ids = torch.ones(2, CANONICAL.num_steps), torch.full((2,), lw.task_id("push"))
-    with pytest.raises(ValueError, match="observation"):
-        features(torch.zeros(2, 40), weights, ids)
-    with pytest.raises(ValueError, match="observation"):
-        features(torch.full((2, 39), torch.nan), weights, ids)
-
-
-def test_training_without_contacts_is_refused():
-    replay, actor = make_replay(), make_role_actor()
-    replay.append_transform(transform_of(actor))
-    config = lw.BehavioralCloningConfig(steps=1, batch_size=8, normalize=False)
-    with pytest.raises(ValueError, match="fit_normalization"):
-        lw.BehavioralCloningTrainer(actor, replay, config, progress=False)
-    fit_normalization(actor, replay)
-    lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()

@@ -5,7 +5,6 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl.language.skills import SkillError
 
 PLANS = lw.load_plans("MT10")
 PUSH = lw.task_id("push")
@@ -89,14 +88,3 @@ def test_custom_skills_and_other_plans(tmp_path):
     state = TensorDict(observation=torch.rand(1, 39), task_id=ids, qaf=torch.ones(1, 1).bool(), batch_size=[1])
     assert not actor(state)["action"].any()
     assert actor.with_plans({"reach": plan}).plans == actor.plans
-
-
-def test_unknown_skills_and_seeds_out_of_range_are_refused():
-    plan = lw.ConditionalPlan.from_pairs("reach", [("the gripper is open", "place the gripper above the puck")])
-    with pytest.raises(SkillError, match="task 'reach' lacks"):
-        lw.ScriptedSkillActor({"reach": plan})
-    plan = lw.ConditionalPlan.from_pairs("push", [("the gripper is open", "put the gripper above the puck")])
-    with pytest.raises(ValueError, match="did you mean 'place the gripper above the puck'"):
-        lw.ScriptedSkillActor({"push": plan})
-    with pytest.raises(ValueError, match="seed"):
-        lw.ScriptedSkillActor(PLANS, "random", seed=2**70)

@@ -1,7 +1,5 @@
 """StochasticActor: TorchRL's sampling on our trunks, as a copy of a trained actor."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from small_actors import (
@@ -10,16 +8,11 @@ from small_actors import (
     make_descriptor,
     make_role_actor,
     make_rows,
-    small_decoder,
 )
 from tensordict.nn import ProbabilisticTensorDictSequential
-from torch import nn
-from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.utils import ValueEstimators
+from torchrl.envs import ExplorationType, set_exploration_type
 
-import lw_torchrl as lw
-from lw_torchrl.modules import Concat, FocusFeatures, ObservationFeatures, RoleFeatures, Value, transform_of
+from lw_torchrl.modules import Concat, FocusFeatures, ObservationFeatures, RoleFeatures
 
 
 def trained(kind="plan", **options):
@@ -97,50 +90,6 @@ def test_feature_noise_is_off_in_likelihoods():
     first, second = (actor.get_dist(rows.clone()).log_prob(torch.zeros(50, 4)) for _ in range(2))
     assert torch.equal(first, second)
     assert [part.noise for part in before.features.parts] == [0.2, 0.2, 0.2]
-
-
-def test_nested_action_key(tmp_path):
-    actor = make(out_keys=[("agent", "action")])
-    keys = [("agent", name) for name in ("loc", "scale", "action", "action_log_prob")]
-    assert actor.out_keys[-4:] == keys
-    assert actor.spec["agent", "action"].shape == (4,)
-    lw.save_actor(actor, tmp_path / "policy.safetensors")
-    assert lw.load_actor(tmp_path / "policy.safetensors").out_keys == actor.out_keys
-
-
-def test_actors_without_a_gaussian_copy_are_refused():
-    with pytest.raises(TypeError, match="MLPDecoder"):
-        make_actor(decoder=nn.LazyLinear(4)).stochastic()
-    bare = make_actor(decoder=small_decoder(squash=False))
-    with pytest.raises(ValueError, match="distribution"):
-        bare.stochastic("tanh_normal")
-    assert bare.stochastic("normal")(make_rows(2))["action"].shape == (2, 4)
-    with pytest.raises(ValueError, match="distribution"):
-        bare.stochastic("gauss")
-    with pytest.raises(ValueError, match="init_std"):
-        make_actor().stochastic(init_std=0.0)
-
-
-def test_evaluation_and_collection():
-    actor = make().eval()
-    result = lw.evaluate(actor, tasks="push", episodes_per_task=1, seed=1_000, max_steps=5, progress=False)
-    assert result.mean_success == 0.0
-    env = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"]), transform_of(actor))
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        data = env.rollout(4, actor)
-    env.close()
-    assert data["action_log_prob"].shape == (2, 4)
-
-
-def test_v_trace_accepts_the_actor():
-    actor = make()
-    rows = drawn(actor, make_rows(6)).detach().reshape(1, 6)
-    flag = torch.zeros(1, 6, 1, dtype=torch.bool)
-    rewards = {"reward": torch.ones(1, 6, 1), "done": flag, "terminated": flag}
-    rows["next"] = make_rows(6, seed=1).reshape(1, 6).update(rewards)
-    loss = ClipPPOLoss(actor, Value(actor.trunk, width=8))
-    loss.make_value_estimator(ValueEstimators.VTrace)
-    assert loss(rows)["loss_objective"].isfinite()
 
 
 def test_contacts_are_copied():

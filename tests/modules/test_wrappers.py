@@ -1,12 +1,9 @@
 """Wrappers of any actor: ensembles, a decided gripper, demonstrated tasks, another robot."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from small_actors import (
     CANONICAL,
-    PLANS,
     action_of,
     make_actor,
     make_descriptor,
@@ -17,7 +14,6 @@ from small_actors import (
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import lw_torchrl as lw
 from lw_torchrl.language.layout import METAWORLD, Layout, Slot
@@ -34,7 +30,6 @@ from lw_torchrl.modules import (
 )
 from lw_torchrl.modules.wrappers import decided
 from lw_torchrl.suites import load_suite
-from lw_torchrl.training import fit_normalization
 
 PLAIN = TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
 
@@ -76,16 +71,6 @@ def test_any_modules_can_be_members():
     ensemble, rows = ActorEnsemble([PLAIN, PLAIN]), make_rows(3)
     assert ensemble.in_keys == ["observation"]
     torch.testing.assert_close(action_of(ensemble, rows), action_of(PLAIN, rows))
-
-
-def test_members_of_different_plans_or_tasks_are_refused():
-    with pytest.raises(ValueError, match="members"):
-        ActorEnsemble([])
-    for other in (make_actor(Plans([PLANS["reach"]])), make_descriptor()):
-        with pytest.raises(ValueError, match="plans"):
-            ActorEnsemble([make_actor(), other])
-    with pytest.raises(ValueError, match="tasks"):
-        ActorEnsemble([make_descriptor(), make_descriptor("reach")])
 
 
 # ---- DecidedGripper
@@ -188,22 +173,6 @@ def test_each_row_acts_by_the_policy_of_its_task():
         torch.testing.assert_close(action_of(policy, state), action_of(part, state))
 
 
-def test_demonstrated_actor_with_custom_keys():
-    policy = make_demonstrated(in_keys=["qaf", ("agent", "which"), "state"])
-    assert policy.in_keys == ["qaf", ("agent", "which"), "state"]
-    state = state_of(policy)
-    moved = TensorDict({"qaf": state["qaf"], "state": state["observation"], ("agent", "which"): state["task_id"]}, [5])
-    assert torch.equal(action_of(policy, moved), action_of(make_demonstrated(), state))
-
-
-def test_each_policy_acts_once_a_step():
-    policy, calls = make_demonstrated(), []
-    policy.others.register_forward_hook(lambda *_: calls.append("others"))
-    policy.demonstrated.register_forward_hook(lambda *_: calls.append("demonstrated"))
-    policy(state_of(policy))
-    assert sorted(calls) == ["demonstrated", "others"]
-
-
 def test_with_plans_changes_only_the_policy_with_plans():
     policy = make_demonstrated()
     steps = [("the gripper is open", "grab the puck"), ("the gripper is closed", "bring the puck to the goal")]
@@ -220,27 +189,6 @@ def test_another_suite_leaves_only_the_policy_with_plans():
     fetch = lw.canonical_plans(load_suite("fetch").plans)
     assert type(make_demonstrated().with_plans(fetch)) is lw.PlanConditionedActor
     assert TransferredActor(make_demonstrated(), fetch).tasks == tuple(fetch)
-
-
-def test_both_policies_are_fitted_and_evaluated():
-    policy = make_demonstrated()
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(50), batch_size=8)
-    ids = torch.full((50,), lw.task_id("push"))
-    replay.extend(TensorDict(observation=torch.randn(50, 39), task_id=ids, batch_size=[50]))
-    fit_normalization(policy, replay)
-    assert policy.demonstrated.features.mean.any()
-    assert policy.others.features.demonstrated.sum() == 1
-    result = lw.evaluate(policy, tasks=["push", "hammer"], episodes_per_task=1, seed=1_000, max_steps=3, progress=False)
-    assert result.mean_success == 0.0
-
-
-def test_unsuitable_pairs_of_policies_are_refused():
-    plain, others = make_descriptor(SEEN), make_actor()
-    for wrong in ((others, others), (plain, plain), (others, plain), (PLAIN, others)):
-        with pytest.raises(ValueError, match="demonstrated"):
-            DemonstratedActor(*wrong)
-    with pytest.raises(ValueError, match="layout"):
-        DemonstratedActor(plain, make_actor(load_suite("fetch").plans))
 
 
 # ---- TransferredActor
@@ -264,14 +212,6 @@ def test_full_displacement_stays_full_or_keeps_its_metres():
         batch_size=[3],
     )
     assert action_of(moved, lw.QAFTransform(fetch)(state)).abs().max() <= 1
-
-
-def test_actors_that_do_not_transfer_are_refused():
-    fetch = lw.canonical_plans(load_suite("fetch").plans)
-    with pytest.raises(ValueError, match="transfer"):
-        TransferredActor(make_actor(CANONICAL), fetch)
-    with pytest.raises(TypeError, match="plans"):
-        TransferredActor(make_descriptor(), fetch)
 
 
 # ---- all

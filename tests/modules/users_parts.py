@@ -1,7 +1,5 @@
 """Parts as a user writes them, in a module of their own: a decoder, a skill encoder, and features of pictures."""
 
-from __future__ import annotations
-
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn

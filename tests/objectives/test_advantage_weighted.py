@@ -1,7 +1,5 @@
 """AdvantageWeightedLoss and standardize_by_task: against sums by hand, and TorchRL's BCLoss."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -151,15 +149,6 @@ def test_in_keys_suffice_and_the_input_stays_unchanged():
     assert torch.equal(value, expected["loss_actor"])
     assert torch.equal(clipped, expected["weight_clipped"])
     assert torch.equal(ess, expected["ESS"])
-
-
-@pytest.mark.parametrize("shape", [(12,), (12, 2), (1, 1), (1, 12)])
-def test_advantages_that_would_broadcast_are_refused(shape):
-    batch = make_batch().exclude("advantage").auto_batch_size_(1)
-    wrong = TensorDict(dict(batch.items()) | {"advantage": torch.zeros(shape)}, batch_size=[])
-    wrong.batch_size = [12] if shape[0] == 12 else []
-    with pytest.raises(ValueError, match="advantage"):
-        lw.objectives.AdvantageWeightedLoss(make_actor())(wrong)
 
 
 ADVANTAGES = st.lists(st.tuples(st.integers(0, 3), FLOATS), min_size=1, max_size=20)

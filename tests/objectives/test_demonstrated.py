@@ -1,10 +1,8 @@
 """TD3 and SAC losses with demonstrations: against the same written out, and TorchRL's."""
 
-from __future__ import annotations
-
 import pytest
 import torch
-from test_losses import BOUNDS, PLANS, SMALL, make_actor, make_batch, make_trunk, total
+from test_losses import BOUNDS, SMALL, make_actor, make_batch, make_trunk, total
 from torchrl.objectives import SACLoss, SoftUpdate, TD3Loss
 
 import lw_torchrl as lw
@@ -115,34 +113,6 @@ def test_is_demonstration_key_can_be_renamed(kind):
     assert torch.equal(total(other, batch), expected)
     with pytest.raises(ValueError, match="is_demonstration"):
         loss.set_keys(is_demonstrations="is_demonstration")
-
-
-@each_kind
-def test_missing_or_wrong_is_demonstration_is_refused(kind):
-    loss, batch = make(kind)[0], make_batch()
-    batch["is_target"] = batch.pop("is_demonstration")  # another column, of co-learning
-    with pytest.raises(ValueError, match="is_demonstration"):
-        loss(batch)
-    batch["is_demonstration"] = torch.zeros(24)
-    with pytest.raises(ValueError, match="is_demonstration"):
-        loss(batch)
-
-
-@pytest.mark.parametrize("sampler", [lw.CoLearningSampler("reach"), lw.TaskBalancedSampler(), None])
-def test_all_rows_of_a_demonstration_buffer_are_imitated(tmp_path, sampler):
-    lw.collect_demonstrations(["push", "reach"], episodes_per_task=1, root=tmp_path / "d", max_steps=20, progress=False)
-    replay = lw.LanguageWorldExperienceReplay(
-        tmp_path / "d", label="executed", batch_size=8, sampler=sampler, transform=lw.QAFTransform(PLANS)
-    )
-    loss, actor, _ = make(lw.objectives.DemonstratedTD3Loss)
-    batch = replay.sample()
-    result = loss.actor_loss(batch)[1]["bc_loss"]
-    torch.testing.assert_close(result, (actor(batch.copy())["action"] - batch["action"]).square().mean())
-
-
-def test_loss_with_and_without_vmap_is_the_same():
-    losses = [make(lw.objectives.DemonstratedTD3Loss, deactivate_vmap=value)[0] for value in (False, True)]
-    torch.testing.assert_close(*(total(loss, make_batch()) for loss in losses))
 
 
 @each_kind

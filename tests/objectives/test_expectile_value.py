@@ -1,7 +1,5 @@
 """ExpectileValueLoss: against sums by hand, and TorchRL's estimator and IQL loss."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np
@@ -14,7 +12,6 @@ from torchrl.objectives.value import TD0Estimator
 
 import lw_torchrl as lw
 from lw_torchrl.modules import ObservationFeatures, Value, descriptor_trunk
-from lw_torchrl.training import fit_normalization
 
 CRITICS = {
     "plan": lambda ensemble, **more: lw.PlanConditionedValue(PLANS, ensemble=ensemble, **SMALL, **more),
@@ -166,18 +163,6 @@ def test_renamed_and_nested_keys():
     assert torch.equal(again(renamed)["loss_value"], plain(batch)["loss_value"])
 
 
-def test_call_with_tensors_of_in_keys():
-    loss, batch = make_loss("description", 1), make_batch(steps=False)
-    given = {"_".join(key) if isinstance(key, tuple) else key: batch[key] for key in loss.in_keys}
-    assert set(given) == {
-        *("observation", "task_id", "next_observation", "next_task_id", "next_reward", "next_done", "next_terminated")
-    }
-    value, mean = loss(**given)
-    expected = loss(batch)
-    assert torch.equal(value, expected["loss_value"])
-    assert torch.equal(mean, expected["value"])
-
-
 def test_feature_noise_is_in_the_loss_but_not_in_advantages():
     loss, batch = make_loss(noise=0.3), make_batch()
     assert loss.value_network.training
@@ -210,28 +195,6 @@ def test_other_estimators():
     assert torch.equal(loss.make_value_estimator(custom).advantage(batch), expected)
     with pytest.raises(NotImplementedError, match="TDLambda"):
         loss.make_value_estimator(ValueEstimators.TDLambda)
-
-
-def test_default_discount_is_099():
-    loss = lw.objectives.ExpectileValueLoss(CRITICS["plan"](2), delay_value=False)
-    batch = make_batch()
-    expected = copy.deepcopy(loss).make_value_estimator(gamma=0.99).advantage(batch)
-    assert torch.equal(loss.advantage(batch), expected)
-
-
-@pytest.mark.parametrize("kind", CRITICS)
-def test_n_step_rows_of_a_buffer(tmp_path, kind):
-    lw.collect_demonstrations(["reach", "push"], episodes_per_task=2, root=tmp_path / "d", max_steps=60, progress=False)
-    replay = lw.LanguageWorldExperienceReplay(
-        tmp_path / "d", label="executed", n_steps=5, gamma=0.9, transform=lw.QAFTransform(PLANS), batch_size=32
-    )
-    loss = make_loss(kind)
-    fit_normalization(loss, replay)
-    batch = replay.sample()
-    assert batch["steps_to_next_obs"].max() == 5
-    expected, _, _, advantages = by_hand(loss, batch)
-    np.testing.assert_allclose(loss.advantage(batch).numpy(), advantages, rtol=1e-3, atol=1e-5)
-    np.testing.assert_allclose(loss(batch)["loss_value"].item(), expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("weighted", [False, True])

@@ -1,7 +1,5 @@
 """Every loss of TorchRL with our actors and critics, without adapters or patches."""
 
-from __future__ import annotations
-
 import copy
 import os
 import warnings
@@ -229,13 +227,6 @@ def test_loss_moves_to_a_gpu_and_back(name, condition):
     assert torch.equal(total(loss, batch), expected)
 
 
-@pytest.mark.parametrize("name", ["SAC", "IQL", "TD3", "CQL", "REDQ"])
-def test_each_critic_draws_its_own_feature_noise(name):
-    loss, _, _ = make_loss(name, "plan", noise=0.1)
-    assert total(loss, make_batch()).isfinite()
-    assert loss.vmap_randomness == "different"
-
-
 @pytest.mark.parametrize("name", ["SAC", "IQL", "TD3", "CQL"])
 def test_loss_with_and_without_vmap_is_the_same(name):
     with_vmap, _, _ = make_loss(name, "plan")
@@ -288,17 +279,3 @@ def test_ppo_ratio_is_one_before_an_update():
         assert result["clip_fraction"] == 0
         torch.testing.assert_close(result["ESS"], torch.tensor(1.0))
         torch.testing.assert_close(result["kl_approx"], torch.tensor(0.0), atol=1e-6, rtol=0)
-
-
-def test_shared_trunk_is_trained_by_actor_and_critic():
-    actor = make_actor("plan", "tanh_normal")
-    value = Value(actor.trunk, **SMALL)
-    assert value.trunk.module["mixer"] is actor.module["mixer"]
-    batch = ready("PPO", make_batch(), actor, value)
-    loss = ClipPPOLoss(actor, value, separate_losses=False)
-    result = loss(batch)
-    shared = actor.module["mixer"].encoder[0].weight
-    names = [name for name, p in loss.named_parameters() if p.shape == shared.shape and p.requires_grad]
-    assert len(names) == 1
-    result["loss_critic"].backward()
-    assert dict(loss.named_parameters())[names[0]].grad.abs().sum() > 0

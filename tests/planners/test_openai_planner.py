@@ -1,4 +1,4 @@
-"""OpenAIPlanner: answers become plans, failures become clear errors, and answers are kept."""
+"""OpenAIPlanner: answers become plans, failures become clear errors, and answers are cached."""
 
 import json
 import socket
@@ -85,9 +85,9 @@ def test_a_damaged_cached_answer_is_requested_again(ask, tmp_path, content):
 
 
 FAILURES = {
-    "429": (error(429, "slow down"), "too many requests, tried 2 times"),
-    "429 for long": (error(429, "no", **{"retry-after-ms": "9e9"}), "too many requests, tried 1 time"),
-    "500": (error(500, "my fault"), "server failed, tried 2 times .*my fault"),
+    "429": (error(429, "slow down"), "too many requests, asked 2 times"),
+    "429 for long": (error(429, "no", **{"retry-after-ms": "9e9"}), "too many requests, asked 1 time"),
+    "500": (error(500, "my fault"), "server failed, asked 2 times .*my fault"),
     "500, without a message": (Failure(500, "<p>oops</p>", {"retry-after-ms": "1"}), "failed.*oops"),
     "429 in 200": (Failure(200, {"error": {"message": "slow down", "code": 429}}), "too many requests"),
     "401": (error(401, "no"), "key in OPENAI_API_KEY"),
@@ -95,14 +95,14 @@ FAILURES = {
     "400": (error(400, "unknown field"), "rejects the request .*unknown field"),
     "400, plain": (Failure(400, "no top_k"), "rejects the request .*no top_k"),
     "context": (error(400, "maximum context length is 2048"), "exceeds the model.s context .*max_tokens"),
-    "cut body": (Failure(200, completion("x" * 99), cut=True), "was interrupted, tried 2"),
+    "cut body": (Failure(200, completion("x" * 99), cut=True), "was interrupted, asked 2"),
     "cut JSON": (Failure(200, '{"choices": ['), "cut off or is not JSON"),
     "HTML": (Failure(200, "<style>a{}</style><body>Welcome</body>"), "not a chat completion: Welcome"),
     "other JSON": (Failure(200, {"hello": 1}), "not a chat completion"),
     "no choices": (Failure(200, {"choices": []}), "has no choices"),
     "null choices": (Failure(200, {"choices": None, "created": 1}), "has no choices"),
-    "a slow reply": (Failure(200, completion("x"), drip=1.0), "answer within 0.4 s, tried 2 times"),
-    "a dripping reply": (Failure(200, completion("x"), drip=0.1), "answer within 0.4 s, tried 1 time"),
+    "a slow reply": (Failure(200, completion("x"), drip=1.0), "answer within 0.4 s, asked 2 times"),
+    "a dripping reply": (Failure(200, completion("x"), drip=0.1), "answer within 0.4 s, asked 1 time"),
     "a large reply": (Failure(200, completion("x" * REPLY_LIMIT)), "larger than 4 MiB"),
 }
 
@@ -119,7 +119,7 @@ def test_a_failure_is_a_clear_error_and_the_other_answers_are_kept(ask, name):
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 1000
     kept = 4 if caught.value.fatal else 9
-    assert f"{kept} of 10 answers are kept" in str(caught.value)
+    assert f"{kept} of 10 answers are cached" in str(caught.value)
     working = FakeServer()
     assert len(ask(working, concurrency=1)) == 10
     assert len(working.requests) == 10 - kept
@@ -143,12 +143,17 @@ def test_temporary_failures_are_retried(ask, failure, constrain):
     assert len(server.requests) == 2
 
 
-def test_a_refused_connection(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("is_local", "tries"), [(True, "1 time"), (False, "2 times")])
+def test_a_refused_connection_is_hardly_retried(tmp_path, monkeypatch, is_local, tries):
+    monkeypatch.setattr("lw_torchrl.planners.chat_client._is_local", lambda address: is_local)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{taken.getsockname()[1]}/v1"
-        planner = lw.OpenAIPlanner("m", base_url=address, cache=tmp_path, retries=0)
-        with pytest.raises(PlannerError, match=f"'m' at {address}, push, attempt 0: the connection failed") as caught:
+        planner = lw.OpenAIPlanner("m", base_url=address, cache=tmp_path)
+        message = (
+            f"'m' at {address}, push, attempt 0: the connection failed or was interrupted, asked {tries}: .*refused"
+        )
+        with pytest.raises(PlannerError, match=message) as caught:
             planner.plans("push", progress=False)
         assert caught.value.fatal
     assert not list(tmp_path.iterdir())
@@ -272,15 +277,6 @@ def test_servers_that_refuse_max_tokens_and_system_messages(ask):
     assert all(answer.decoded.plan for answer in ask(server, concurrency=1))
     assert len(server.requests) == 12
     assert server.requests[-1]["messages"][0]["content"].endswith(lw.planners.plan_prompt(lw.MT10[-1], "chain_py"))
-
-
-def test_a_custom_task(ask, tmp_path):
-    (tmp_path / "tasks.toml").write_text('[stack]\ndescription = "Stack it."\nobjects.brick = "obs[4:7]"\n')
-    stack = lw.load_tasks(tmp_path / "tasks.toml")["stack"]
-    server = FakeServer(lambda body: completion('def stack(robot):\n if check("gripper open"):\n  robot.take("brick")'))
-    (answer,) = ask(server, stack)
-    assert answer.decoded.plan.definition == stack
-    assert answer.decoded.plan.steps[0].skill == "take the brick"
 
 
 @pytest.mark.parametrize(

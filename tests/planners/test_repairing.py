@@ -1,7 +1,5 @@
 """try_plan and repair_plans: a plan runs in the simulator, and its model reads how it fared."""
 
-from __future__ import annotations
-
 import pytest
 from fake_server import PLANS, FakeServer, asked_for, completion, serving
 
@@ -32,9 +30,6 @@ def planner(tmp_path):
         return lw.OpenAIPlanner("m", base_url=address, cache=tmp_path / "kept", **options)
 
     return make
-
-
-# ---- try_plan
 
 
 def test_a_step_that_never_fires_is_named():
@@ -70,9 +65,6 @@ def test_the_facts_describe_a_failure():
     assert "The robot's gripper came within " in facts
     assert "cm of the puck, and ended" in facts
     assert facts.endswith("with this corrected.")
-
-
-# ---- repair_plans
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 import gzip
 import json
 import os
-import re
 import subprocess
 import sys
 
@@ -21,7 +20,7 @@ ERRORS = {
     "a code outside": ({"error": {"message": "later"}, "code": 429}, "too many requests"),
     "a type": ({"error": {"message": "later", "type": "rate_limit_error"}}, "too many requests"),
     "a text": ({"error": "the model is overloaded"}, "too many requests"),
-    "a list": ({"errors": [{"message": "worker died"}]}, "server failed, tried 2 times.*worker died"),
+    "a list": ({"errors": [{"message": "worker died"}]}, "server failed, asked 2 times.*worker died"),
     "in a choice": (
         {"choices": [{"error": {"code": 502, "message": "upstream"}, "message": {"content": "def"}}]},
         "502",
@@ -29,9 +28,9 @@ ERRORS = {
     "in the message": ({"choices": [{"message": {"content": None, "error": {"message": "upstream"}}}]}, "upstream"),
     "old vLLM": (
         {"object": "error", "message": "engine died", "code": 500},
-        "server failed, tried 2 times.*engine died",
+        "server failed, asked 2 times.*engine died",
     ),
-    "FastAPI": ({"detail": "queue is full"}, "server failed, tried 2 times.*queue is full"),
+    "FastAPI": ({"detail": "queue is full"}, "server failed, asked 2 times.*queue is full"),
     "MiniMax": ({"choices": None, "base_resp": {"status_code": 1002, "status_msg": "rate limit"}}, "too many requests"),
 }
 
@@ -160,16 +159,10 @@ def test_a_system_message_that_is_refused_is_merged_once_and_for_all(ask, status
 @pytest.mark.parametrize("status", [429, 503])
 def test_retry_after_is_reported_and_tries_are_counted(ask, status, value, tries, text):
     server = FakeServer(lambda _: Failure(status, {"error": {"message": "no"}}, {"retry-after": value}))
-    with pytest.raises(PlannerError, match=f"tried {tries} time{'s' * (tries > 1)}{text}") as caught:
+    with pytest.raises(PlannerError, match=f"asked {tries} time{'s' * (tries > 1)}{text}") as caught:
         ask(server, "push", retries=1)
     assert len(server.requests) == tries
     assert str(caught.value).isprintable()
-
-
-def test_a_field_that_is_invalid_is_told_apart(ask):
-    detail = [{"loc": ["body", "seed"], "msg": "Extra inputs are not permitted"}]
-    with pytest.raises(PlannerError, match=r"rejects a field of the request as invalid .*seed.*not permitted"):
-        ask(FakeServer(lambda _: Failure(422, {"detail": detail})), "push", seed=1)
 
 
 class Compressing(FakeServer):
@@ -241,9 +234,3 @@ def test_an_invalid_address_in_the_environment_is_named(monkeypatch):
     monkeypatch.setenv("OPENAI_BASE_URL", "localhost:8000")
     with pytest.raises(ValueError, match=r"OPENAI_BASE_URL must be an address .*got 'localhost:8000'"):
         lw.OpenAIPlanner("m")
-
-
-def test_variables_without_effect_on_a_server_of_this_machine_are_named():
-    with serving(FakeServer(failures=[error(503, "busy")] * 9)) as address:
-        last = plans_in(address, SSL_CERT_FILE="/no/such/file.pem")
-    assert re.search("SSL_CERT_FILE[A-Z_, ]*, ignored for a server on this machine", last)

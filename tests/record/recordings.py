@@ -1,7 +1,5 @@
 """Rollouts to record, and recordings read back."""
 
-from __future__ import annotations
-
 import socket
 import uuid
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Recordings of other environments: objects, pictures, rewards, and recorders."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -38,18 +36,6 @@ def test_objects_are_drawn_without_a_robot(tmp_path):
     assert 0.5 < np.linalg.norm(np.subtract(place, target)) < 5, "the camera sees everything"
 
 
-def test_an_observation_of_another_size_needs_no_layout(tmp_path):
-    torch.manual_seed(0)
-    rollout = PendulumEnv().rollout(20)
-    rollout["observation"] = tip_of(rollout)
-    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
-        assert logger.log_episode(rollout, task="swing", objects={"tip": tip_of(rollout)}) == "swing"
-        with pytest.raises(ValueError, match="observation"):
-            logger.log_episode(rollout, task="push", objects={"tip": tip_of(rollout)})
-        with pytest.raises(ValueError, match=r"objects\['tip'\]"):
-            logger.log_episode(rollout, task="swing", objects={"tip": tip_of(rollout)[1:]})
-
-
 def test_a_rollout_may_have_only_pictures_and_rewards(tmp_path):
     pictures = (torch.arange(5, dtype=torch.uint8) * 40)[:, None, None, None].expand(5, 3, 16, 24)
     columns = {"pixels": pictures, "action": torch.arange(5), ("next", "reward"): torch.arange(5.0)[:, None]}
@@ -79,12 +65,3 @@ def test_recorder_records_other_environments(tmp_path, make):
     np.testing.assert_array_equal(recording.array(f"{root}/action", "Scalars:scalars"), first["action"].double())
     shown = recording.array(f"{root}/scene/objects/tip", "Points3D:positions")[:, 0]
     np.testing.assert_allclose(shown, tip_of(first), atol=1e-6)
-
-
-def test_recorder_without_a_task_uses_the_class_name(tmp_path):
-    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
-        env = TransformedEnv(PendulumEnv(), RolloutRecorder(logger))
-        env.rollout(3)
-        env.close()
-        assert logger.episodes == ["PendulumEnv-0"], "an episode that closing cuts is kept as far as it went"
-    assert len(Recording(tmp_path / "a.rrd").values("/PendulumEnv-0/action", "Scalars:scalars")) == 3

@@ -1,9 +1,6 @@
 """Episodes in a recording: logged data is read back exactly, and errors name the wrong column."""
 
-from __future__ import annotations
-
 import io
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -75,16 +72,6 @@ def test_the_plan_follows_the_cursor(tmp_path):
     assert full.startswith(f"1.  if {STEPS[0][0]}  \n{indent}{STEPS[0][1]}")
 
 
-def test_a_long_condition_is_shortened(tmp_path):
-    condition = "the puck looks as if it could be moved " * 20
-    plan = SimpleNamespace(steps=[SimpleNamespace(condition=condition, skill="move the puck")])
-    recording = record(tmp_path / "a.rrd", make_rollout().exclude("qaf", "skill_weights"), plan=plan)
-    (text,) = recording.values("/push/plan", "TextDocument:text")[0]
-    assert text.startswith("if the puck looks as if")
-    assert text.splitlines()[0].endswith(" …  ")
-    assert recording.values("/push/conditions", "TextDocument:text")[0][0].startswith(f"1.  if {condition}")
-
-
 def test_the_active_step_has_a_lane(tmp_path):
     rollout = make_rollout()
     recording = record(tmp_path / "a.rrd", rollout)
@@ -149,14 +136,6 @@ def test_without_a_plan_every_column_is_numbered(tmp_path):
     assert recording.values("/e1/0b_plan_step", "StateChange:state") == [[NONE_HOLDS], [""]]
 
 
-def test_a_goal_that_is_an_object_has_one_label(tmp_path):
-    rollout = make_rollout(5)
-    objects = {"target location": rollout["observation"][:, 36:39]}
-    recording = record(tmp_path / "a.rrd", rollout, objects=objects)
-    assert "/push/scene/goal" not in recording.entities()
-    assert recording.values("/push/scene/objects/target\\ location", "Points3D:labels")[0] == ["target location"]
-
-
 def test_active_step_has_the_largest_weight_or_the_first_true_condition():
     rollout = make_rollout(3, columns=2)
     rollout["skill_weights"] = torch.tensor([[0.9, 0.1], [0.5, 0.5], [0.2, 0.8]])
@@ -181,31 +160,6 @@ def test_episodes_have_different_names(tmp_path):
     recording = Recording(tmp_path / "a.rrd")
     for root, rollout in (("/push", first), ("/push-2", second), ("/best\\ so\\ far", first)):
         np.testing.assert_array_equal(recording.array(f"{root}/action", "Scalars:scalars"), rollout["action"].double())
-
-
-def test_the_layout_is_in_the_file(tmp_path):
-    recording = record(tmp_path / "a.rrd", make_rollout())
-    (store,) = recording.reader.blueprints()
-    chunks = recording.reader.stream(store=store)
-    text = " ".join(f"{chunk.entity_path} {chunk.to_record_batch()}" for chunk in chunks)
-    views = ("Scene", "Verdict", "Plan", "Skill weights", "Action", "/push/scene/trails/puck", "push · success at 11")
-    assert all(view in text for view in views)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda r: r.exclude("observation"), "observation"),
-        (lambda r: r[None], r"batch size .*\(1, 20\)"),
-        (lambda r: r.set("observation", torch.rand(20, 38)), "observation.*20×38"),
-        (lambda r: r.set("action", torch.full((20, 4), float("nan"))), "action.*finite"),
-        (lambda r: r.set("qaf_logits", torch.rand(20, 1)), "qaf_logits"),
-    ],
-)
-def test_errors_name_the_wrong_column(tmp_path, change, message):
-    rollout = make_rollout()
-    with RerunLogger(tmp_path / "a.rrd") as logger, pytest.raises(ValueError, match=message):
-        logger.log_episode(change(rollout.clone()), task="push", objects=make_objects(rollout), plan=PLAN)
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,6 @@
-"""RerunLogger as a TorchRL logger: metrics, images, videos, hyperparameters and histograms are read back exactly."""
-
-from __future__ import annotations
+"""RerunLogger as a TorchRL logger: metrics, videos, hyperparameters and histograms are read back exactly."""
 
 import io
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -13,7 +10,6 @@ import torch
 from PIL import Image
 from recordings import Recording
 from tensordict import TensorDict
-from torchrl.record import VideoRecorder
 from torchrl.record.loggers import Logger
 
 from lw_torchrl.record import RerunLogger
@@ -76,13 +72,11 @@ def test_each_group_of_metrics_has_a_view(tmp_path):
     with RerunLogger(tmp_path / "a.rrd") as logger:
         for name in ("loss/bc", "loss/latent", "eval/success", "lr", "eval/reach/success"):
             logger.log_scalar(name, 1.0)
-        logger.log_image("scene", torch.rand(4, 4))
         logger.log_histogram("action", [1.0, 2.0])
         logger.log_video("view", torch.zeros(2, 3, 4, 4, dtype=torch.uint8), step=3)
     assert Recording(tmp_path / "a.rrd").shown_tabs() == {
         "Metrics": ["loss", "eval", "lr"],
         "Histograms": ["action"],
-        "Images": ["scene"],
         "Videos": ["view/step 3"],
     }
 
@@ -116,43 +110,12 @@ def test_videos_are_read_back(tmp_path, channels):
     with RerunLogger(tmp_path / "a.rrd") as logger:
         logger.log_video("plain", video)
         logger.log_video("batched", video[None], step=100, fps=10)
-        logger.log_video("two", torch.stack([video, video]))
     recording = Recording(tmp_path / "a.rrd")
-    for entity in ("/videos/plain", "/videos/batched/step\\ 100", "/videos/two/0", "/videos/two/1"):
+    for entity in ("/videos/plain", "/videos/batched/step\\ 100"):
         shown = pixels(recording, entity).reshape(4, 24, 32, channels).astype(int)
         assert np.abs(shown - video.permute(0, 2, 3, 1).numpy()).max() < 12
     seconds = recording.times("/videos/batched/step\\ 100", "EncodedImage:blob", "time")
     assert [int(second) for second in seconds] == [0, 100_000_000, 200_000_000, 300_000_000]
-
-
-def test_images_are_read_back(tmp_path):
-    image = smooth(frames=1)[0]
-    with RerunLogger(tmp_path / "a.rrd") as logger:
-        for variant in (image, image.permute(1, 2, 0), image.permute(1, 2, 0).numpy(), image / 255):
-            logger.log_image("scene", variant)
-        logger.log_image("grey", image[0], step=7)
-        for wrong in (image[:2], image.float(), image[0, 0], image[:, :0], image.long()):
-            with pytest.raises(ValueError, match="image 'wrong'"):
-                logger.log_image("wrong", wrong)
-    recording = Recording(tmp_path / "a.rrd")
-    assert recording.times("/images/scene", "EncodedImage:blob", "global_step") == [0, 1, 2, 3]
-    assert recording.times("/images/grey", "EncodedImage:blob", "global_step") == [7]
-    for shown in pixels(recording, "/images/scene"):
-        assert np.abs(shown.astype(int) - image.permute(1, 2, 0).numpy()).max() < 12
-    assert np.abs(pixels(recording, "/images/grey")[0].astype(int) - image[0].numpy()).max() < 12
-
-
-def test_torchrls_video_recorder_writes_to_it(tmp_path):
-    with RerunLogger(tmp_path / "a.rrd") as logger:
-        recorder = VideoRecorder(logger, tag="rollout", skip=1, make_grid=False)
-        frames = smooth(frames=5)
-        for frame in frames:
-            recorder._apply_transform(frame)
-        recorder.dump()
-    recording = Recording(tmp_path / "a.rrd")
-    (entity,) = {entity for entity in recording.entities() if entity.startswith("/videos/")}
-    shown = pixels(recording, entity)
-    assert np.abs(shown.astype(int) - frames[-len(shown) :].permute(0, 2, 3, 1).numpy()).max() < 12
 
 
 def test_hyperparameters_are_a_table(tmp_path):
@@ -190,9 +153,3 @@ def test_episodes_of_several_threads_have_different_names(tmp_path):
     finally:
         sys.setswitchinterval(before)
     assert sorted(names) == sorted({"reach", *(f"reach-{number}" for number in range(2, 25))})
-
-
-@pytest.mark.slow
-def test_importing_the_package_does_not_import_rerun():
-    code = "import sys, lw_torchrl.record; sys.exit('rerun' in sys.modules or 'rerun_bindings' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,13 +1,9 @@
 """RolloutRecorder: a live recording equals the one that log_rollout makes of the rollout afterwards."""
 
-from __future__ import annotations
-
-import pytest
 import torch
 from recordings import Recording
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, SerialEnv, TransformedEnv
-from torchrl.envs.transforms import ObservationNorm
+from torchrl.envs import Compose, TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl.record import RolloutRecorder
@@ -108,24 +104,3 @@ def test_a_clone_records_its_own_rows(tmp_path):
         assert logger.episodes == []
         env.close()
         assert logger.episodes == ["reach-0"]
-
-
-def test_a_single_environment_without_rows(tmp_path):
-    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
-        env = TransformedEnv(lw.LanguageWorldEnv("reach", batch_size=(), max_steps=3), RolloutRecorder(logger))
-        env.rollout(3)
-        env.close()
-        assert logger.episodes == ["reach-0"]
-
-
-def test_wrong_rows_plans_and_environments_are_errors(tmp_path):
-    norm = ObservationNorm(loc=0.0, scale=2.0, in_keys=["observation"])
-    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
-        with pytest.raises(ValueError, match="rows must be less than 2"):
-            make(logger, rows=(7,))
-        with pytest.raises(ValueError, match="plans have no plan for soccer"):
-            TransformedEnv(lw.LanguageWorldEnv("soccer"), RolloutRecorder(logger, plans=PLANS))
-        with pytest.raises(TypeError, match="SerialEnv"):
-            TransformedEnv(SerialEnv(1, lambda: lw.LanguageWorldEnv("reach")), RolloutRecorder(logger))
-        with pytest.raises(ValueError, match="ObservationNorm"):
-            TransformedEnv(lw.LanguageWorldEnv("reach"), Compose(norm, RolloutRecorder(logger)))

@@ -1,7 +1,5 @@
 """The viewer: opened at a tab and a step, in a browser, and drawing a picture."""
 
-from __future__ import annotations
-
 import signal
 import stat
 import subprocess
@@ -68,7 +66,7 @@ def test_missing_or_unreadable_recordings_and_unknown_episodes_are_errors(tmp_pa
         open_viewer(tmp_path / "a.rrd", episode="push")
     for content in (b"", b"something else"):
         (tmp_path / "b.rrd").write_bytes(content)
-        with pytest.warns(UserWarning, match="was not closed"), pytest.raises(ValueError, match="Rerun recording"):
+        with pytest.warns(UserWarning, match="was not closed"), pytest.raises(ValueError, match="damaged"):
             open_viewer(tmp_path / "b.rrd")
 
 
@@ -85,7 +83,7 @@ FORGED = {
 def test_forged_recordings_are_called_damaged(tmp_path, forge):
     path = write(tmp_path / "a.rrd")
     path.write_bytes(forge(path.read_bytes()))
-    with pytest.raises(ValueError, match=r"a\.rrd' is not a Rerun recording, or is damaged"):
+    with pytest.raises(ValueError, match=r"a\.rrd' .* damaged"):
         open_viewer(path)
 
 

@@ -1,6 +1,5 @@
 """A custom suite works wherever Meta-World does: environment, data, training, files, evaluation, recordings."""
 
-import math
 import pickle
 from dataclasses import replace
 from functools import partial
@@ -8,13 +7,11 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
-from torchrl.objectives import TD3Loss
 from toy_suite import SKILLS, TASKS, TOY, ToyEngine, make_toy_suite
 
 import lw_torchrl as lw
-from lw_torchrl.language.layout import METAWORLD, Slot
+from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
 from lw_torchrl.modules import (
     ActorEnsemble,
@@ -159,18 +156,6 @@ def test_failures_are_attributed_with_the_suites_skills():
     assert [failure.cause for failure in result.failures] == ["skill", "skill"]
 
 
-def test_evaluators_and_critics_read_the_layout(demos):
-    evaluator = lw.modules.StateQueryEvaluator(SUITE.plans, width=8)
-    actor = TensorDictSequential(evaluator, lw.PlanConditionedActor(SUITE.plans, **small()))
-    env = lw.LanguageWorldEnv("toy", suite=SUITE)
-    state = actor(env.reset())
-    assert state["action"].shape == (2, 7)
-    state = lw.QAFTransform(SUITE.plans)(env.reset())
-    state["action"] = torch.zeros(2, 7)
-    assert lw.PlanConditionedQValue(SUITE.plans, width=8)(state)["state_action_value"].shape == (2, 1)
-    env.close()
-
-
 def test_metaworld_policy_acts_in_the_suite():
     """The policy is not trained: only sizes, units and signs are tested."""
     trained = role_actor(lw.load_plans("MT10"), 4).eval()
@@ -185,13 +170,6 @@ def test_metaworld_policy_acts_in_the_suite():
     assert set(result.success_once) == set(TASKS)
 
 
-def test_policies_that_cannot_transfer_raise():
-    with pytest.raises(ValueError, match="'differences' of layout 'metaworld' do not transfer to 'toy'"):
-        TransferredActor(lw.PlanConditionedActor(lw.load_plans("MT10")), SUITE.plans)
-    with pytest.raises(TypeError, match="plans"):
-        TransferredActor(lw.modules.DescriptorConditionedActor("MT10"), SUITE.plans)
-
-
 def test_transferred_policy_is_saved(tmp_path):
     moved = TransferredActor(role_actor(lw.load_plans("MT10"), 4), CANONICAL, speed=1.5).eval()
     lw.save_actor(moved, tmp_path / "moved.safetensors")
@@ -201,14 +179,6 @@ def test_transferred_policy_is_saved(tmp_path):
     assert torch.equal(again(state.clone())["action"], moved(state.clone())["action"])
     assert (again.layout, again.trained, again.speed) == (TOY, METAWORLD, 1.5)
     env.close()
-
-
-def test_plans_of_two_suites_do_not_mix():
-    both = [*lw.load_plans("MT10").values(), *SUITE.plans.values()]
-    with pytest.raises(lw.PlanError, match=r"layout.*'metaworld'"):
-        lw.Plans(both)
-    with pytest.raises(ValueError, match=r"tasks .*fetch, metaworld"):
-        lw.LanguageWorldEnv(["fetch/reach", "reach"])
 
 
 def test_suites_are_found_by_name(monkeypatch):
@@ -223,24 +193,9 @@ def test_suites_are_found_by_name(monkeypatch):
         lw.LanguageWorldEnv("toy/touch-rad")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"tasks": {"toy/other": TASKS["toy/touch-red"]}}, "tasks .*'toy/touch-red' as 'toy/other'"),
-        ({"tasks": {"reach": lw.TASKS["reach"]}}, "task 'reach' must have the layout of suite 'toy'"),
-        ({"name": "tay"}, "tasks of suite 'tay' must be named 'tay/...'"),
-        ({"plans": lw.load_plans("MT10")}, "plans of suite 'toy' must be for tasks in the suite"),
-    ],
-)
-def test_contradictory_suites_raise(change, message):
-    options = {"name": "toy", "layout": TOY, "tasks": TASKS, "make_engine": ToyEngine} | change
-    with pytest.raises(ValueError, match=message):
-        Suite(**options)
-
-
 def wrong_findings(suite):
     """What check_suite finds wrong, and its measurements."""
-    return {(finding.what, finding.measured) for finding in check_suite(suite) if not finding.right}
+    return {(finding.what, finding.measured) for finding in check_suite(suite) if finding.right is False}
 
 
 def what_is_wrong(layout, engine, plans=None):
@@ -263,6 +218,8 @@ class Broken(ToyEngine):
             seen[:, 4:13] = -seen[:, 4:13]
         elif self.fault == "single":
             seen = seen.astype(np.float32)
+        elif self.fault == "high":
+            seen[:, 6] = 0.025
         return seen
 
     def reset(self, rows, seeds):
@@ -274,6 +231,8 @@ class Broken(ToyEngine):
         if self.fault == "restless":
             self.state[1, 1] += 0.01
         done = done._replace(observation=self._broken(done.observation))
+        if self.fault == "always success":
+            done = done._replace(success=np.ones_like(done.success))
         return tuple(done) if self.fault == "tuple" else done
 
 
@@ -287,11 +246,18 @@ class Broken(ToyEngine):
         ("all rows", "a reset of one of two rows"),
         ("restless", "an inactive row"),
         ("tuple", "a step"),
+        ("always success", "success while the hand rests for 30 steps"),
     ],
 )
 def test_check_finds_a_broken_engine(fault, what, monkeypatch):
     monkeypatch.setattr(Broken, "fault", fault)
     assert what in dict(wrong_findings(make_toy_suite(Broken)))
+
+
+def test_check_notes_an_object_that_may_lie_elsewhere_than_on_the_table(monkeypatch):
+    monkeypatch.setattr(Broken, "fault", "high")
+    unclear = {finding.what for finding in check_suite(make_toy_suite(Broken)) if finding.right is None}
+    assert unclear == {"object 1 rests at"}
 
 
 @pytest.mark.parametrize(
@@ -337,42 +303,6 @@ def test_check_finds_a_gripper_that_does_not_move():
     assert what_is_wrong(still, ToyEngine, plans) == {"gripper"}
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"opening": 2}, "index 2 .*more than once"),
-        ({"things": (Slot(3),)}, "index 3 .*more than once"),
-        ({"past": 2, "size": 40}, "more than once"),
-        ({"gripper": 2}, "gripper .*displacement"),
-    ],
-)
-def test_number_of_a_layout_has_one_meaning(change, message):
-    with pytest.raises(ValueError, match=message):
-        replace(TOY, **change)
-
-
-def td3(plans):
-    actor, critic = lw.PlanConditionedActor(plans, **small()), lw.PlanConditionedQValue(plans, width=8)
-    return TD3Loss(actor, critic, bounds=(-1.0, 1.0))
-
-
-def value(plans):
-    return lw.objectives.ExpectileValueLoss(lw.PlanConditionedValue(plans, width=8))
-
-
-@pytest.mark.parametrize("make_loss", [td3, value])
-def test_losses_train_offline_with_the_layouts_statistics(make_loss, demos):
-    plans = SUITE.plans
-    loss = make_loss(plans)
-    loss.make_value_estimator(gamma=0.9)
-    replay = lw.LanguageWorldExperienceReplay(
-        demos.root, label="executed", n_steps=3, gamma=0.9, transform=lw.QAFTransform(plans)
-    )
-    trainer = lw.OfflineTrainer(loss, replay, lw.OfflineConfig(steps=2, batch_size=8), progress=False)
-    trainer.train()
-    assert all(map(math.isfinite, trainer.last.values()))
-
-
 @pytest.mark.parametrize("suite", ["metaworld", "fetch"])
 def test_suites_and_tables_are_pickled_and_read_only(suite):
     suite = load_suite(suite)
@@ -383,6 +313,23 @@ def test_suites_and_tables_are_pickled_and_read_only(suite):
         assert pickle.loads(pickle.dumps(table)) == table
         with pytest.raises(TypeError, match="does not support item assignment"):
             table["new"] = table[min(table)]
+
+
+@pytest.mark.parametrize(("number", "wrong"), [(0, set()), (5, {"opening of the red block"})])
+def test_openings_are_checked_and_answered_in_a_suite_whose_actions_move_joints(number, wrong):
+    """Number 0 is between 0 and 1, number 5 a position."""
+    red = TASKS["toy/touch-red"]
+    objects = (red.objects[0], replace(red.objects[1], opening=number))
+    red = replace(red, objects=objects, layout=replace(TOY, displacement=None, gripper=None))
+    findings = check_suite(Suite("toy", red.layout, {red.name: red}, ToyEngine))
+    assert {finding.what for finding in findings if finding.right is False} == wrong
+    assert "opening of the red block" in {finding.what for finding in findings}
+    state, ids = torch.zeros(2, TOY.size), torch.full((2,), lw.task_id(red.name))
+    state[1, number] = 1.0
+    assert lw.QueryProgram({red: ["the red block is open"]})(state, ids).tolist() == [[False], [True]]
+    plans = lw.Plans([lw.ConditionalPlan.from_pairs(red, [("the red block is open", "stay")])])
+    logits = lw.modules.StateQueryEvaluator(plans, width=8).logits(state, ids)
+    assert not torch.equal(logits[0], logits[1])
 
 
 class Planar(ToyEngine):

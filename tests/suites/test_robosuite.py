@@ -6,7 +6,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import lw_torchrl as lw
@@ -37,25 +36,6 @@ def test_check_finds_nothing_wrong(suite):
     """One task is enough: the others have the same arm, gripper and frame."""
     lift = replace(suite, tasks={"robosuite/lift": suite.tasks["robosuite/lift"]}, plans=None)
     assert [finding for finding in check_suite(lift) if not finding.right] == []
-
-
-def test_seed_determines_an_episode(suite):
-    engine = suite.make_engine(["robosuite/lift", "robosuite/lift"])
-    first = engine.reset([0, 1], [7, 8])
-    action = np.array([[0.3, -0.5, -1.0, 1.0]] * 2, np.float32)
-    walk = [engine.step(action, np.array([True, True])).observation for _ in range(5)]
-    before = np.random.get_state()[1].copy()  # noqa: NPY002
-    again = engine.reset([1, 0], [7, 8])
-    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
-    np.testing.assert_array_equal(again, first)
-    assert not np.array_equal(first[0], first[1])
-    for state in walk:
-        np.testing.assert_array_equal(engine.step(action, np.array([True, True])).observation[[1, 0]], state)
-    alone = engine.step(action, np.array([True, False]))
-    np.testing.assert_array_equal(alone.observation[1], walk[-1][0])
-    unstable = engine.step(np.full_like(action, np.nan), np.array([False, True]))
-    assert unstable.fault.tolist() == [False, True]
-    engine.close()
 
 
 @pytest.mark.parametrize("task", ["lift", "stack", "door"])

@@ -1,7 +1,5 @@
 """A custom suite in NumPy: three blocks, no numbers of the previous step, actions of 7 numbers, of which 4 count."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import lw_torchrl as lw

@@ -1,7 +1,5 @@
 """Fixtures of the cloning tests: demonstrations, and the state of an uninterrupted training."""
 
-from __future__ import annotations
-
 import pytest
 from small_training import collect_demos, everything, make_trainer
 

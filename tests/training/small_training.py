@@ -1,8 +1,7 @@
 """Small trainings that can be stopped at a step, and all of their state to compare."""
 
-from __future__ import annotations
-
 import torch
+from torchrl.record.loggers import Logger
 
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.language.plan_files import load_plans
@@ -70,6 +69,16 @@ def make_trainer(root, checkpoint=None, *, actor=None, config=CONFIG, sampler=No
     trainer = Stopping(actor, make_replay(root, sampler), config, checkpoint=checkpoint, progress=False, **options)
     trainer.stop_at = stop_at
     return trainer
+
+
+class ScalarLog(Logger):
+    """Keeps the scalars that are logged."""
+
+    def __init__(self):
+        self.scalars = []
+
+    def log_scalar(self, name, value, step=None):
+        self.scalars.append((name, step, value))
 
 
 def flat(value, path=()):

@@ -1,8 +1,5 @@
 """Policy files: load_actor rebuilds the same policy, and refuses damaged files and files of other kinds."""
 
-from __future__ import annotations
-
-import json
 import shutil
 from dataclasses import replace
 
@@ -228,21 +225,6 @@ def test_saving_draws_no_random_numbers(path):
     assert torch.equal(torch.get_rng_state(), before)
 
 
-@pytest.mark.parametrize(
-    ("about", "message"),
-    [
-        ({"format": 3}, "about must not use reserved names, got format"),
-        ({"state": 3}, "about must not use reserved names, got state"),
-        ({"note": {1: "a", "1": "b"}}, "the key '1' more than once"),
-        ({"note": float("nan")}, "JSON"),
-    ],
-)
-def test_metadata_that_could_not_be_read_again_is_refused(tmp_path, path, about, message):
-    with pytest.raises(ValueError, match=message):
-        lw.save_actor(small(), path, **about)
-    assert not list(tmp_path.iterdir())
-
-
 # ---- other files and damaged ones
 
 
@@ -251,11 +233,6 @@ def assert_refused(path, message):
         lw.load_actor(path)
     assert str(caught.value).startswith("checkpoint: ")
     assert str(path) in str(caught.value)
-
-
-def test_the_error_for_a_missing_file_names_the_file(path):
-    with pytest.raises(FileNotFoundError, match=r"checkpoint: no file .*c\.safetensors"):
-        lw.load_actor(path)
 
 
 def test_files_of_another_kind_are_refused(saved, tmp_path, path):
@@ -312,14 +289,3 @@ def test_a_flipped_bit_is_detected(path):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match="is corrupted"):
             lw.load_actor(path)
-
-
-def test_a_small_file_cannot_describe_a_huge_policy(tmp_path):
-    actor = lw.PlanConditionedActor(lw.load_plans("MT10"), decoder=lw.modules.MLPDecoder(width=3, depth=1))
-    lw.save_actor(actor, tmp_path / "a.safetensors")
-    description, _ = read_tensors(tmp_path / "a.safetensors")
-    changed = json.dumps(description).replace('"width": 3', '"width": 50000').replace('"depth": 1', '"depth": 2')
-    assert "50000" in changed
-    write_tensors(tmp_path / "b.safetensors", json.loads(changed), {})
-    with pytest.raises(ValueError, match="larger tensors than the file holds"):
-        lw.load_actor(tmp_path / "b.safetensors")

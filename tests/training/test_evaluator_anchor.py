@@ -1,7 +1,5 @@
 """Imitation that also trains an evaluator: the anchor keeps its answers close to the exact ones."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -53,9 +51,3 @@ def test_training_changes_the_evaluator_and_resumes_bit_for_bit(demos, tmp_path)
     assert_same(everything(resumed), everything(whole))
     rows = whole.replay[:].select("observation", "task_id")
     assert torch.equal(lw.load_actor(path)(rows.clone())["action"], whole.actor.eval()(rows.clone())["action"])
-
-
-def test_a_policy_without_an_evaluator_is_refused(demos):
-    replay = lw.LanguageWorldExperienceReplay(demos, transform=lw.QAFTransform(PLANS))
-    with pytest.raises(ValueError, match="qaf_anchor"):
-        lw.BehavioralCloningTrainer(make_actor(), replay, replace(CONFIG, qaf_anchor=1.0))

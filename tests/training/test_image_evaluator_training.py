@@ -1,7 +1,5 @@
 """An ImageQueryEvaluator learns from pictures to answer queries and to locate objects."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -36,11 +34,6 @@ def replay(tmp_path_factory):
 def make(seed=0, **options):
     torch.manual_seed(seed)
     return lw.modules.ImageQueryEvaluator(PLANS, **PICTURES, hidden=16, depth=1, **options)
-
-
-def make_trainer(replay, path=None, config=CONFIG, **options):
-    data = lw.training.LabelledQueries(replay, config)
-    return lw.training.QueryEvaluatorTrainer(make(**options), data, config, checkpoint=path, progress=False)
 
 
 @pytest.mark.slow
@@ -100,18 +93,3 @@ def test_only_states_with_their_own_picture_are_used(replay):
     sparse.add_column("pixels", pictures[torch.arange(len(sparse)) // 20 * 20])
     with pytest.raises(ValueError, match="every"):
         lw.training.LabelledQueries(sparse, CONFIG)
-
-
-def test_rows_without_pictures_are_refused(replay):
-    plain = lw.LanguageWorldExperienceReplay(replay.root, label="executed")
-    with pytest.raises(ValueError, match=r"data must have the column 'pixels'"):
-        make_trainer(plain)
-
-
-def test_pictures_of_other_cameras_and_a_config_for_observations_are_refused(replay):
-    data = lw.training.LabelledQueries(replay, CONFIG)
-    evaluator = lw.modules.ImageQueryEvaluator(PLANS, cameras="corner", height=24, width=24)
-    with pytest.raises(ValueError, match="pixels must be uint8 of shape"):
-        lw.training.QueryEvaluatorTrainer(evaluator, data, CONFIG)
-    with pytest.raises(TypeError, match="config must be an ImageQueryEvaluatorConfig"):
-        lw.training.QueryEvaluatorTrainer(make(), data, lw.training.QueryEvaluatorConfig(every=5))

@@ -1,7 +1,5 @@
 """Ctrl-C ends training between two steps with a checkpoint."""
 
-from __future__ import annotations
-
 import random
 import signal
 import threading

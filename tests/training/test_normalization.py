@@ -1,13 +1,8 @@
 """fit_normalization reaches every network of a loss, including its targets and copies."""
 
-from __future__ import annotations
-
-import copy
-
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
 from torchrl.data import LazyTensorStorage, ListStorage, RandomSampler, TensorDictReplayBuffer
 from torchrl.objectives import CQLLoss, DDPGLoss, IQLLoss, REDQLoss, SACLoss, TD3Loss
 
@@ -65,43 +60,6 @@ def test_statistics_reach_all_networks_of_a_loss(replay, expected, kind):
         for name, value in statistics.items():
             fitted = getattr(expected[kind], name.rpartition(".")[2])
             assert torch.equal(value, fitted.expand_as(value)), (type(loss), name)
-
-
-def test_the_loss_uses_the_statistics():
-    """The loss's critic then gives the same values as a fitted critic with the same weights."""
-    _, q, _ = make()
-    other = copy.deepcopy(q)
-    loss = DDPGLoss(make()[0], q)
-    rows = TensorDict(
-        observation=torch.rand(50, 39), task_id=torch.full((50,), lw.task_id("push")), action=torch.zeros(50, 4)
-    ).auto_batch_size_(1)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(50), batch_size=8)
-    buffer.extend(rows)
-    rows = lw.QAFTransform(PLANS)(rows)
-    fit_normalization(loss, buffer)
-    with loss.value_network_params.to_module(loss.value_network):
-        values = loss.value_network(rows.copy())["state_action_value"]
-    assert not torch.allclose(other(rows.copy())["state_action_value"], values)
-    fit_normalization(other, buffer)
-    assert torch.equal(other(rows.copy())["state_action_value"], values)
-
-
-def test_features_of_any_module_are_fitted(replay, expected):
-    actor, q, v = make()
-    for target in (actor, q, v, nn.ModuleList([make()[0]])):
-        fit_normalization(target, replay)
-        for module in target.modules():
-            if isinstance(module, ObservationFeatures):
-                assert torch.equal(module.mean, expected["differences"].mean)
-
-
-def test_a_module_without_features_and_rows_that_lack_a_key_are_refused(replay):
-    with pytest.raises(ValueError, match="target"):
-        fit_normalization(nn.Linear(2, 2), replay)
-    other = TensorDictReplayBuffer(storage=LazyTensorStorage(4), batch_size=2)
-    other.extend(TensorDict(seen=torch.rand(4, 39), batch_size=[4]))
-    with pytest.raises(ValueError, match="observation"):
-        fit_normalization(make()[0], other)
 
 
 def test_rows_may_be_in_a_list_and_in_double_precision(replay, expected):

@@ -1,7 +1,5 @@
 """Training that is interrupted or killed anywhere resumes from its checkpoint bit for bit."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

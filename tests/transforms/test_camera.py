@@ -1,11 +1,8 @@
 """CameraTransform: pictures of the rows that moved, every N steps."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from pictures import why_no_pictures
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
@@ -69,7 +66,7 @@ def test_picture_is_held_for_every_steps_and_renewed_at_a_reset():
     env.close()
 
 
-def test_mrendered_rows_are_not_rendered(monkeypatch):
+def test_rows_that_rest_are_not_rendered(monkeypatch):
     env = opened(num_envs=4)
     state, rendered = env.reset(), []
     render = env.base_env.render
@@ -80,15 +77,6 @@ def test_mrendered_rows_are_not_rendered(monkeypatch):
     assert rendered == [[1, 2]]
     assert torch.equal(after[~moved], before[~moved])
     env.close()
-
-
-def test_pictures_do_not_depend_on_other_rows():
-    many, alone = opened(["drawer-open"], num_envs=3), opened(["drawer-open"], batch_size=())
-    state, one = many.reset(), alone.reset(episode=1)
-    assert one["pixels"].shape == (24, 32, 3)
-    assert torch.equal(one["pixels"], state["pixels"][1])
-    many.close()
-    alone.close()
 
 
 def test_state_dict_holds_the_environments_and_requires_a_reset():
@@ -113,21 +101,3 @@ def test_camera_belongs_into_each_worker():
     env.close()
     with pytest.raises(TypeError, match="worker"):
         TransformedEnv(SerialEnv(2, lambda: lw.LanguageWorldEnv("reach")), lw.transforms.CameraTransform())
-
-
-def test_replay_buffer_is_refused_with_a_hint_to_add_pictures():
-    buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=lw.transforms.CameraTransform(), batch_size=2)
-    env = lw.LanguageWorldEnv("reach")
-    buffer.extend(env.rollout(4).reshape(-1))
-    env.close()
-    with pytest.raises(ValueError, match=r"lw\.data\.add_pictures.*load_pictures"):
-        buffer.sample()
-
-
-def test_rendering_unknown_rows_is_refused():
-    env = lw.LanguageWorldEnv("reach")
-    env.reset()
-    with pytest.raises(ValueError, match="rows"):
-        env.render(rows=[0, 3])
-    assert env.render(rows=[]).shape == (0, 240, 320, 3)
-    env.close()

@@ -1,7 +1,5 @@
 """Keys of transforms can be renamed, and transforms in a wrong order are refused."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -15,7 +13,6 @@ from torchrl.envs import (
     StepCounter,
     TransformedEnv,
     VecNormV2,
-    check_env_specs,
 )
 
 import lw_torchrl as lw
@@ -56,29 +53,12 @@ def nested(sample: TensorDict) -> TensorDict:
     return result
 
 
-# --- keys ----------------------------------------------------------------------------------------------------------
-
-
 def test_nested_keys_on_a_sample():
     sample = rows()
     plain, moved = queries()(sample.clone()), queries(**NESTED)(nested(sample))
     assert torch.equal(moved["plan", "truth"], plain["qaf"])
     assert torch.equal(moved["next", "plan", "truth"], plain["next", "qaf"])
     assert "qaf" not in moved.keys(True)
-
-
-def test_nested_keys_in_an_environment():
-    rename = RenameTransform(in_keys=["observation", "task_id"], out_keys=NESTED["in_keys"])
-    env = TransformedEnv(make_env(), Compose(rename, queries(**NESTED)))
-    check_env_specs(env)
-    plain = TransformedEnv(make_env(), queries())
-    env.set_seed(0)
-    plain.set_seed(0)
-    result, expected = (e.rollout(4, lambda td: td.set("action", torch.ones(2, 4))) for e in (env, plain))
-    assert torch.equal(result["plan", "truth"], expected["qaf"])
-    assert torch.equal(result["next", "plan", "truth"], expected["next", "qaf"])
-    env.close()
-    plain.close()
 
 
 def test_random_yaw_with_renamed_keys():
@@ -99,13 +79,6 @@ def test_random_yaw_with_renamed_keys():
     assert torch.equal(beside["next", "turned"], expected["next", "observation"])
     assert torch.equal(beside["turned_action"], expected["action"])
 
-
-def test_missing_nested_key_is_named():
-    with pytest.raises(ValueError, match=r"\('robot', 'state'\)"):
-        queries(**NESTED)(rows())
-
-
-# --- order ---------------------------------------------------------------------------------------------------------
 
 BEFORE = {
     "ObservationNorm": norm,
@@ -148,16 +121,6 @@ def test_random_yaw_before_qaf_is_refused():
         Compose(lw.RandomYaw(0.5), queries())
     with pytest.raises(ValueError, match="QAFTransform before RandomYaw"):
         TensorDictReplayBuffer(storage=LazyTensorStorage(6), transform=Compose(lw.RandomYaw(0.5), queries()))
-
-
-def test_transforms_after_qaf_do_not_change_the_answers():
-    plain = TransformedEnv(make_env(), queries())
-    env = TransformedEnv(make_env(), Compose(StepCounter(), queries(), norm(), norm("observation", "again")))
-    result, expected = env.reset(), plain.reset()
-    assert torch.equal(result["qaf"], expected["qaf"])
-    assert torch.equal(result["observation"], expected["observation"] * 2.0)
-    env.close()
-    plain.close()
 
 
 def test_queries_in_the_workers_may_be_followed_by_a_normaliser():

@@ -1,11 +1,10 @@
-"""LanguageInstruction: the task's description, under TorchRL's key, in environments, collectors and buffers."""
+"""LanguageInstruction: the task's description, under TorchRL's key, in environments and buffers."""
 
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 import lw_torchrl as lw
@@ -42,17 +41,6 @@ def test_specs(batched):
     env = batched()
     check_env_specs(env)
     env.close()
-
-
-@pytest.mark.slow
-def test_parallel_environment_and_collector():
-    env = ParallelEnv(2, make, mp_start_method="fork")
-    assert env.reset()["language_instruction"] == [TEXTS, TEXTS]
-    env.close()
-    collector = Collector(make, frames_per_batch=6, total_frames=6, trajs_per_batch=None)
-    for batch in collector:
-        assert [row[0] for row in batch["language_instruction"]] == TEXTS
-    collector.shutdown()
 
 
 def test_buffer_rows_have_the_descriptions_of_their_tasks():

@@ -1,16 +1,13 @@
 """QAFTransform writes what QueryProgram answers, in an environment and on a replay buffer."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from functools import partial
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
-from torchrl.envs import Compose, InitTracker, SerialEnv, StepCounter, TransformedEnv
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.envs import Compose, StepCounter, TransformedEnv
 
 import lw_torchrl as lw
 
@@ -85,14 +82,6 @@ def test_answers_are_the_programs_at_every_step(rollout):
     assert not torch.equal(rollout["qaf"][:, STEPS], rollout["next", "qaf"][:, STEPS - 1]), "a reset answers afresh"
 
 
-def test_specs(env):
-    spec = env.observation_spec["qaf"]
-    assert isinstance(spec, Binary)
-    assert spec.shape == (ROWS, WIDTH)
-    assert spec.dtype == torch.bool
-    assert env.fake_tensordict()["next", "qaf"].shape == (ROWS, WIDTH)
-
-
 def test_masked_rows_keep_their_answers(env):
     env.set_seed(0)
     state = env.reset()
@@ -107,35 +96,6 @@ def test_masked_rows_keep_their_answers(env):
     assert not torch.equal(state["qaf"][mask], first["qaf"][mask])
     assert torch.equal(fresh["qaf"][~mask], state["qaf"][~mask])
     assert torch.equal(fresh["qaf"], answers(fresh["observation"], fresh["task_id"]))
-
-
-def test_some_rows_of_a_worker_are_reset(few_plans):
-    make = partial(lw.LanguageWorldEnv, ["push", "reach"], seed=0, max_steps=9)
-    workers = SerialEnv(2, [partial(make, worker=(w, 2)) for w in range(2)])
-    env = TransformedEnv(workers, lw.QAFTransform(few_plans))
-    state = env.step(env.reset().set("action", torch.zeros(2, 2, 4)))["next"]
-    fresh = env.reset(state.clone().set("_reset", torch.tensor([[False, True], [False, False]])))
-    assert fresh["episode"].tolist() == [[0, 2], [1, 1]]
-    assert torch.equal(fresh["qaf"], answers(fresh["observation"], fresh["task_id"]))
-    env.close()
-
-
-def test_other_transforms_around_it(few_plans):
-    env = TransformedEnv(
-        lw.LanguageWorldEnv(["push", "reach"], seed=0, max_steps=4),
-        Compose(StepCounter(), lw.QAFTransform(few_plans), InitTracker()),
-    )
-    rollout = env.rollout(6, break_when_any_done=False)
-    assert torch.equal(rollout["qaf"], answers(rollout["observation"], rollout["task_id"]))
-    assert rollout["step_count"][0].flatten().tolist() == [0, 1, 2, 3, 0, 1]
-    env.close()
-    later = TransformedEnv(lw.LanguageWorldEnv("reach", seed=0))
-    later.append_transform(lw.QAFTransform(few_plans))
-    assert later.reset()["qaf"].shape == (1, WIDTH)
-    later.close()
-
-
-# --- on a replay buffer --------------------------------------------------------------------------------------------
 
 
 def buffer(data: TensorDictBase, plans: lw.Plans) -> TensorDictReplayBuffer:
@@ -185,9 +145,6 @@ def test_any_leading_shape(rollout, few_plans):
     assert torch.equal(one["next", "qaf"], rollout["next", "qaf"][2, 7])
 
 
-# --- bad input -----------------------------------------------------------------------------------------------------
-
-
 def test_task_without_a_plan_is_refused_at_once(few_plans):
     env = lw.LanguageWorldEnv(["reach", "sweep", "soccer"])
     with pytest.raises(lw.PlanError, match="soccer, sweep"):
@@ -198,35 +155,3 @@ def test_task_without_a_plan_is_refused_at_once(few_plans):
     with pytest.raises(lw.PlanError, match="soccer, sweep"):
         transformed.append_transform(lw.QAFTransform(few_plans))
     env.close()
-
-
-def wrong_states() -> dict[str, dict[str, Tensor]]:
-    """States of which one entry, the first word of their name, is wrong."""
-    observation, reach = torch.zeros(3, 39), torch.full((3,), lw.task_id("reach"))
-    nan, infinite, unknown, outside = observation.clone(), observation.clone(), reach.clone(), reach.clone()
-    nan[1, 4], infinite[2, 0], unknown[1], outside[0] = torch.nan, torch.inf, lw.task_id("soccer"), 50
-    observations = {"narrow": torch.zeros(3, 36), "wide": torch.zeros(3, 40), "integer": observation.long()}
-    observations |= {"nan": nan, "infinite": infinite}
-    ids = {"no plan": unknown, "too large": outside, "negative": reach - 100, "float": reach.float()}
-    ids |= {"extra axis": reach.expand(2, 3).T}
-    return {
-        **{f"observation {name}": {"observation": wrong, "task_id": reach} for name, wrong in observations.items()},
-        **{f"task_id {name}": {"observation": observation, "task_id": wrong} for name, wrong in ids.items()},
-    }
-
-
-@pytest.mark.parametrize("case", wrong_states())
-@pytest.mark.parametrize("place", ["now", "next"])
-def test_wrong_states_are_refused(few_plans, case, place):
-    state = wrong_states()[case]
-    good = {"observation": torch.zeros(3, 39), "task_id": torch.full((3,), lw.task_id("reach"))}
-    data = {**state} if place == "now" else {**good, "next": state}
-    with pytest.raises(ValueError, match=case.split()[0]):
-        lw.QAFTransform(few_plans)(TensorDict(data, [3]))
-
-
-@pytest.mark.parametrize("key", ["observation", "task_id"])
-def test_missing_key_is_named(few_plans, key):
-    data = TensorDict({"observation": torch.zeros(3, 39), "task_id": torch.full((3,), lw.task_id("reach"))}, [3])
-    with pytest.raises((KeyError, ValueError), match=key):
-        lw.QAFTransform(few_plans)(data.exclude(key))

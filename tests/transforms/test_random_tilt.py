@@ -105,13 +105,6 @@ def test_motions_with_a_direction_are_not_tilted():
         assert torch.equal(turns, NOW.expand(400, 3, 3)) == (way is not None)
 
 
-def test_tilt_requires_canonical_plans():
-    with pytest.raises(ValueError, match="canonical_plans"):
-        lw.RandomYaw(0.1, plans=MT10, tilt=0.5)
-    with pytest.raises(ValueError, match="tilt"):
-        lw.RandomYaw(0.1, tilt=0.5)
-
-
 def test_tilt_rate():
     was = rows("push", 3, 4_000)
     share = (tilted(was, 0.25)["observation_tilt"] != NOW).any((-1, -2)).float().mean()
@@ -133,18 +126,6 @@ def test_role_features_are_tilted_like_the_action(times):
     seen = features(now)["features"]
     direction = torch.nn.functional.normalize
     torch.testing.assert_close(direction(seen[:, :3], dim=-1), direction(now["action"][:, :3], dim=-1))
-
-
-def test_role_features_add_the_target_offset():
-    task, step = next((t, n) for t in PLANS for n, s in enumerate(PLANS[t].steps) if s.role.verb == "push")
-    was = rows(task, step, 50)
-    was["observation"] *= 0.1  # positions farther than 25 cm count as 25 cm away
-    was["skill_weights"] = torch.nn.functional.one_hot(torch.full((50,), step), PLANS.num_steps).float()
-    features = lw.modules.RoleFeatures(PLANS).eval()
-    now = lw.transforms.JitterTarget(PLANS, 0.01)(was)
-    shift = features(now.copy())["features"][:, :3] - features(was.copy())["features"][:, :3]
-    near = (was["observation"][:, 4:7] - was["observation"][:, :3]).norm(dim=-1) < 0.15
-    torch.testing.assert_close(shift[near] * 0.1, now["target_offset"][near])
 
 
 def test_renamed_keys():

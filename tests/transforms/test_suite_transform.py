@@ -1,6 +1,5 @@
 """SuiteTransform: numbers of the previous step, the task, actions of a layout."""
 
-import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
 
@@ -35,14 +34,6 @@ def test_numbers_of_the_previous_step_are_filled_in():
     assert (rollout["task_id"] == lw.task_id("push")).all()
 
 
-def test_queries_and_actors_after_it():
-    plans = lw.Plans([lw.load_plans("MT10")["push"]])
-    env = make(lw.QAFTransform(plans))
-    rollout = env.rollout(3, lw.PlanConditionedActor(plans).eval())
-    assert rollout["qaf"].shape == rollout["skill_weights"].shape
-    env.close()
-
-
 def test_action_is_converted_only_for_the_environment():
     env = make(act=lambda action: -action)
     state = env.reset()
@@ -51,18 +42,4 @@ def test_action_is_converted_only_for_the_environment():
     assert torch.equal(after["next", "executed_action"], -state["action"])
     assert torch.equal(after["action"], state["action"])
     assert env.action_spec.shape == (2, 4)
-    env.close()
-
-
-def test_observation_of_another_size_is_refused():
-    env = TransformedEnv(lw.LanguageWorldEnv("push"), SuiteTransform(PUSH, lambda seen: seen[..., :7]))
-    with pytest.raises(ValueError, match="observe"):
-        env.reset()
-    env.close()
-
-
-def test_missing_key_is_named():
-    env = TransformedEnv(lw.LanguageWorldEnv("push"), SuiteTransform(PUSH, lambda seen: seen, in_keys=["state"]))
-    with pytest.raises(ValueError, match="state"):
-        env.reset()
     env.close()

@@ -41,7 +41,7 @@ _EXTRAS = {"av": "exchange", "h5py": "exchange", "pyarrow": "exchange", "minari"
 
 
 class MissingDataWarning(UserWarning):
-    """A warning that an imported file lacks columns of a dataset."""
+    """A warning that an imported file lacks some of the standard dataset columns."""
 
 
 @contextmanager
@@ -217,9 +217,9 @@ def _format_of(source: Path) -> ImportFormat:
 
 
 def _own_metadata(source: Path) -> Mapping[str, Any] | None:
-    """Return the dataset's metadata from files that :func:`export_dataset` wrote; None for other files."""
+    """Return the original dataset's metadata from files written by :func:`export_dataset`; None for other files."""
     if (path := source / "meta" / f"{ABOUT}.json").is_file():
-        return read_json(path, "our metadata")
+        return read_json(path, "the metadata of lw_torchrl")
     for path in (source / "data" / "metadata.json", source / "metadata.json"):
         if path.is_file() and (text := read_json(path, "Minari's metadata").get(ABOUT)):
             return parse_json(str(text).encode())

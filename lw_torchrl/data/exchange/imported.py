@@ -43,8 +43,8 @@ class ImportedTable(EpisodeRows):
         columns, sources: arrays (R, ...) by the names of :data:`KEYS`, and the columns' names in the files.
         lengths, tasks: the number of rows and the possible names of the task of each episode.
         ends_known: whether the files state where episodes end.
-        unfit: names in the files of columns whose sizes do not fit.
-        notes: what the files lack.
+        unfit: for each column whose size does not fit, the column's name in the files.
+        notes: messages about data that the files lack.
     """
 
     columns: Mapping[str, Array]
@@ -56,12 +56,12 @@ class ImportedTable(EpisodeRows):
     notes: tuple[str, ...]
 
     def explain(self, name: str) -> str:
-        """Return the end of a warning for a missing column: the column whose size does not fit."""
+        """Return the end of a warning about a missing column if a column in the files has the wrong size, else ""."""
         return f" ({self.unfit[name]} does not have one number per row)" if name in self.unfit else ""
 
 
 def read_files(source: Path, is_hdf5: bool, layout: Layout) -> ImportedTable:
-    """Read HDF5 or parquet files in a child process with limits; see :mod:`.reader`."""
+    """Read HDF5 or parquet files in a child process with time and memory limits; see :mod:`.reader`."""
     widths = {name: 1 if name not in WIDE else layout.action_size if "action" in name else layout.size for name in KEYS}
     order = [name for name in reader.NAMES if name in widths]
     stored = reader.stored_bytes(reader.data_files(source, reader.HDF5 if is_hdf5 else reader.PARQUET))
@@ -92,10 +92,11 @@ def read_files(source: Path, is_hdf5: bool, layout: Layout) -> ImportedTable:
 
 
 def find_ends(table: ImportedTable, suite: Suite, episode_length: int | None) -> ImportedTable:
-    """Return a table whose episodes end; if the files do not state where, derive the ends, and note how.
+    """Return the table with the ends of all episodes. If the files do not state the ends, derive them and add a note.
 
-    Rows marked as done, terminated or truncated end an episode, unless they follow each other: then the marks are a
-    state, such as success. Otherwise, episodes have ``episode_length`` steps, or as many as the suite allows.
+    A row that is marked as done, terminated or truncated ends an episode, unless marked rows are consecutive: such
+    marks describe a state, such as success. Without usable marks, episodes have ``episode_length`` steps, or the
+    suite's maximum.
     """
     if table.ends_known:
         if episode_length is not None:
@@ -171,7 +172,7 @@ def exported_columns(table: ImportedTable) -> dict[str, Array]:
 
 
 def complete_columns(table: ImportedTable, suite: Suite) -> tuple[dict[str, Array], list[str]]:
-    """Return all columns of a dataset from an imported table, and an explanation for each missing column."""
+    """Return all columns of a dataset from an imported table, and an explanation for each column that it lacks."""
     rows, lacking = table.rows, [*table.notes]
     used = ["observation", "action", "next_observation", "reward_dense"]
     used.append("success" if "success" in table.columns else "reward_sparse")  # other columns must not cause errors

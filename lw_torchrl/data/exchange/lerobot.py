@@ -54,7 +54,7 @@ def _feature(column: Array) -> dict[str, Any]:
 
 
 def write(table: Table, folder: Path, bar: Progress) -> None:
-    """Write a table, and the pictures of its dataset as videos, as a LeRobot dataset."""
+    """Write a table as a LeRobot dataset, with the pictures of the original dataset as videos."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -187,7 +187,7 @@ def _combined(parts: list[dict[str, Array]]) -> dict[str, Array]:
 def _write_videos(
     demonstrations: Demonstrations, pictures: Pictures, folder: Path, key: str, fps: int
 ) -> tuple[dict[str, list[Any]], list[dict[str, Array]]]:
-    """Write videos with one frame per row; rows between two rendered pictures repeat the earlier picture.
+    """Write videos with one frame per row; a row without a rendered picture repeats the previous picture.
 
     Return the location of each episode, and statistics (3, 1, 1) of each episode's pixel values in [0, 1].
     """

@@ -25,7 +25,7 @@ _BEFORE = ("expert_action", "unclipped_action", HOLDS, "next_observation")
 
 
 def _infos(table: Table, start: int, end: int) -> dict[str, Array]:
-    """Return an episode's infos (T + 1 rows); next observations only if they differ from the following observations."""
+    """Return an episode's infos (T + 1 rows); omit next observations that equal the observations of the next rows."""
     infos = {}
     observation, after = (table.columns[name][start:end] for name in ("observation", "next_observation"))
     for name in (*_AFTER, *_BEFORE):
@@ -84,9 +84,10 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
 
 
 def _reserve(file: Path, size: int) -> None:
-    """Reserve ``size`` bytes on the disk after the end of an HDF5 file, which shrinks again when HDF5 closes the file.
+    """Reserve ``size`` bytes of disk space at the end of an HDF5 file; HDF5 frees unused space when it closes the file.
 
-    A write that fails inside HDF5, because the disk is full, leaves the file open, and the process crashes at exit.
+    Otherwise a write could fail inside HDF5 because the disk is full. HDF5 would leave the file open, and the process
+    would crash at exit.
     """
     if hasattr(os, "posix_fallocate"):  # not on macOS
         with file.open("r+b") as handle:

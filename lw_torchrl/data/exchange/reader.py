@@ -54,7 +54,7 @@ TASK_NAMES = (
     "env_id", "task_id", "task_index",
 )  # fmt: skip
 """The names that files use for an episode's task: attributes, columns, and keys of JSON."""
-_AFTER = ("reward_sparse", "reward_dense", "success", "done", "terminated", "truncated")  # describe the step before
+_AFTER = ("reward_sparse", "reward_dense", "success", "done", "terminated", "truncated")  # results of the last step
 HDF5, PARQUET = (".hdf5", ".h5", ".hdf"), (".parquet", ".pq")
 
 
@@ -63,7 +63,7 @@ class Refused(Exception):
 
 
 def data_files(source: Path, endings: Sequence[str]) -> list[Path]:
-    """Return the files below a path with one of the endings; numbers in names are compared by value.
+    """Return the files below a path that have one of the endings, sorted by name, with numbers in order of value.
 
     Hidden files are left out, for example the companions ``._NAME`` that macOS writes to shared disks.
     """
@@ -81,7 +81,7 @@ def natural(name: str) -> str:
 
 
 def stored_bytes(paths: Iterable[Path]) -> int:
-    """Return the bytes that files occupy on the disk; holes of sparse files do not count."""
+    """Return the number of bytes that files occupy on disk, without the holes of sparse files."""
     states = [path.stat() for path in paths]
     return sum(min(state.st_size, state.st_blocks * 512) for state in states)
 
@@ -93,10 +93,10 @@ class Files:
         widths: the number of values per row of each column to read.
         allowed: the number of bytes that may still be read.
         columns, sources: the columns that were read, and the names of these columns in the files.
-        unfit: the names of columns whose sizes do not fit.
+        unfit: for each column whose size does not fit, the column's name in the files.
         lengths, tasks: the number of rows and the possible task names of each episode.
         ends_known: whether the files state where episodes end.
-        notes: what the files lack.
+        notes: messages about data that the files lack.
     """
 
     def __init__(self, widths: Mapping[str, int], allowed: int) -> None:
@@ -115,7 +115,8 @@ class Files:
             raise Refused(f"{name} declares {size / 1e6:,.0f} MB or more, which is too much for files of this size")
 
     def choose(self, column: str, fits: Mapping[str, bool]) -> str | None:
-        """Return the file's name for a dataset's column: the first name that ``fits``, or None."""
+        """Choose the column in the files from which to read a dataset's ``column``: the first known name that
+        ``fits``, or None."""
         present = [name for name in NAMES[column] if name in fits]
         if fitting := [name for name in present if fits[name]]:
             self.sources[column] = fitting[0]
@@ -124,7 +125,8 @@ class Files:
         return self.sources.get(column)
 
     def require(self, column: str, seen: Mapping[str, float]) -> None:
-        """Raise :class:`Refused` unless a name was chosen for a column; ``seen`` are the columns' values per row."""
+        """Raise :class:`Refused` unless a name was chosen for a column. ``seen`` maps each column in the files to its
+        number of values per row."""
         if column not in self.sources:
             sizes = {name: f"{width:g}" if width % 1 == 0 else "different sizes" for name, width in seen.items()}
             listed = ", ".join(f"{name} ({size})" for name, size in [*sizes.items()][:20]) or "unknown"
@@ -205,8 +207,9 @@ def read_parquet(source: Path, files: Files) -> None:
 
 
 def _leaves(metadata: Any) -> tuple[int, dict[str, tuple[str, int, bool]]]:
-    """Return the number of rows of a parquet file, and by name the path of each leaf column, its number of values, and
-    whether the values are numbers. Names lack the levels of lists: "action.list.element" is "action"."""
+    """Return the number of rows of a parquet file, and a mapping from the name of each leaf column to its path, its
+    number of values and whether these are numbers. Names omit the levels of lists: "action.list.element" becomes
+    "action"."""
     leaves: dict[str, tuple[str, int, bool]] = {}
     for place in range(metadata.num_columns):
         number = sum(metadata.row_group(group).column(place).num_values for group in range(metadata.num_row_groups))
@@ -238,7 +241,7 @@ def _numbers(name: str, column: Any) -> Array:
 
 
 def _strings(column: Any) -> Array:
-    """Convert an Arrow column to strings (R,); None for absent ones."""
+    """Convert an Arrow column to strings (R,); absent strings become None."""
     import pyarrow as pa
 
     return np.array(column.cast(pa.string()).to_pylist(), dtype=object)
@@ -277,7 +280,7 @@ def _find_episodes(
     order = np.lexsort((frame, episode))
     same = _same(episode[order])
     if "frame_index" in read and (same & _same(frame[order])).any():
-        order = np.lexsort((frame, episode, file))  # each file numbers its episodes on its own
+        order = np.lexsort((frame, episode, file))  # each file has its own numbering of episodes
         same = _same(episode[order]) & _same(file[order])
         if (same & _same(frame[order])).any():
             raise Refused("frame_index must differ between the rows of an episode")
@@ -300,7 +303,7 @@ def _find_episodes(
 
 
 def _same(column: Array) -> Array:
-    """Return for each row but the first whether its value equals that of the row before."""
+    """Compare the value of each row, except the first, with the previous row; return whether they are equal."""
     return np.asarray(column[1:] == column[:-1])
 
 
@@ -332,7 +335,7 @@ def read_hdf5(source: Path, files: Files) -> None:
     paths = data_files(source, HDF5)
     shapes: list[dict[str, tuple[int, ...]]] = []
     for path in paths:
-        path.open("rb").close()  # HDF5's own errors do not tell limits of the system from damage
+        path.open("rb").close()  # HDF5's own errors do not distinguish limits of the system from damaged files
         with h5py.File(path, "r") as file:
             for group, known in _groups(file):
                 files.ends_known &= known
@@ -371,7 +374,8 @@ def read_hdf5(source: Path, files: Files) -> None:
 
 
 def _groups(file: Any) -> Iterator[tuple[Any, bool]]:
-    """Yield the groups of a file that hold episodes; False if the group holds several episodes one after another."""
+    """Yield (group, is_single) for each group of a file that holds episodes. ``is_single`` is False for a group that
+    holds several episodes one after another."""
     import h5py
 
     for container in [file["data"], file] if isinstance(file.get("data"), h5py.Group) else [file]:
@@ -415,7 +419,8 @@ def _items(group: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _steps(columns: Mapping[str, Array]) -> dict[str, Array]:
-    """Return columns with one row per time step; the observations of T + 1 rows are those before and after a step."""
+    """Return the columns with one row for each of T time steps. T + 1 rows of observations become the observations
+    before and after each step."""
     steps = len(columns["action"])
     of_steps: dict[str, Array] = {}
     for name, column in columns.items():
@@ -429,7 +434,7 @@ def _steps(columns: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def _companion(path: Path) -> Any:
-    """Read the JSON file that ManiSkill or Minari writes beside an HDF5 file, if there is one."""
+    """Read the JSON file that ManiSkill or Minari writes next to an HDF5 file, if there is one."""
     for beside in (path.with_suffix(".json"), path.with_name("metadata.json")):
         with suppress(ValueError, RecursionError):
             if beside.is_file():
@@ -438,7 +443,7 @@ def _companion(path: Path) -> Any:
 
 
 def _texts(value: Any) -> Iterator[str]:
-    """Yield the values of the keys in TASK_NAMES, in a mapping, in nested mappings and in texts that hold JSON."""
+    """Yield the values of the keys in TASK_NAMES in a mapping, in nested mappings, and in texts that contain JSON."""
     if isinstance(value, Mapping):
         for name in TASK_NAMES:
             yield from _plain_texts(value.get(name))
@@ -461,7 +466,7 @@ def _texts_of_items(group: Any) -> Iterator[str]:
 
 
 def _plain_texts(value: Any) -> Iterator[str]:
-    """Yield a text, a whole number, or the first of an array of texts or numbers, as a text without quotes."""
+    """Yield a text or whole number as an unquoted string; of an array, only the first element."""
     if isinstance(value, (list, np.ndarray)):
         value = np.asarray(value, dtype=object).flatten()[0] if np.size(value) else None
     if isinstance(value, bytes):

@@ -3,45 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from lw_torchrl._util.checks import Count, Scale, missing_keys, typed
-from lw_torchrl._util.devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.diagnose.failure import (
-    REPLACEMENTS,
-    Cause,
-    Difference,
-    Failure,
-    Finding,
-    Misled,
-    WrongMotion,
+from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, Cause, Failure, Finding
+from lw_torchrl.evaluation.diagnose.replacements import EpisodeId, Scripts
+from lw_torchrl.evaluation.diagnose.reruns import Reruns, Settings, shares_of
+from lw_torchrl.evaluation.diagnose.states import (
+    OFTEN_WRONG,
+    WRONG,
+    Blame,
+    Departures,
+    FailedEpisode,
+    blame_answers,
+    blame_plan,
+    blame_step,
+    departures,
+    last_active_step,
 )
-from lw_torchrl.evaluation.diagnose.replacements import EpisodeId, Scripts, gripper_of, own_evaluators
-from lw_torchrl.evaluation.diagnose.reruns import Rerun, Reruns
-from lw_torchrl.evaluation.diagnose.states import EpisodeStates, Explanation, explain, stall_step, states_of
+from lw_torchrl.language.canonical import explain_canonical, fallback_plan
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
-from lw_torchrl.language.tasks import task_id
-from lw_torchrl.modules.parts import evaluating
+from lw_torchrl.language.tasks import TASKS, task_id
 from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.suites.suite import Suite, find_suite
 
 MARGIN = 0.3  # a clear lead of one replacement, as a fraction of the task's failed episodes
-_FACTS = (
-    "environment",
-    "perception",
-    "query",
-    "wrapper",
-)  # tried only after a wrong observation, answer or action was measured
-_PARTS = ("skill", "gripper", "actuation", "policy", "plan")  # in the order in which they count
-_SEEN = 0.01  # meters by which an observation must be wrong to count if correcting it does not help
+# These replacements were tried only after a wrong environment, observation, answer or action was measured.
+_FACTS = ("environment", "perception", "query", "wrapper")
+_PARTS = ("skill", "gripper", "actuation", "policy", "plan")  # in order of precedence
+_SEEN = 0.01  # metres by which an observation must be wrong to count if correcting it does not help
 _CLEAR = 0.1  # root mean square by which executed actions must differ from the commanded ones
 
 
@@ -50,7 +46,7 @@ def attribute_failures(
     rollouts: Iterable[FinishedEpisode | TensorDictBase],
     plans: AnyPlans,
     *,
-    actor: Callable[[TensorDictBase], TensorDictBase] | None = None,
+    actor: Callable[[TensorDictBase], TensorDictBase],
     reference: AnyPlans | None = None,
     evaluator: Callable[[TensorDictBase], TensorDictBase] | None = None,
     skills: Mapping[str, ScriptedSkill] | None = None,
@@ -67,32 +63,19 @@ def attribute_failures(
     """Find the cause of each failed episode: the environment, the observations, the answers to the plan's conditions,
     the plan, a skill, another part of the policy, the noise, or the time limit.
 
-    Without ``actor``, a rule examines the states: the cause is *query* if the policy acted on wrong answers; *plan* if,
-    late in the episode, plan and reference request different actions, or no condition holds; otherwise *skill*.
+    **Measurements come first**. Each episode is re-run with the same noise and nothing replaced. Differences from the
+    rollout, and errors in the observations, answers and executed actions, show the causes *environment differs*, *not
+    reproducible*, *perception*, *query*, *actuation* and *gripper*.
 
-    With ``actor``, **measurements come first**. Each episode is re-run with the same noise and nothing replaced.
-
-    - *environment differs*: the first state, or the state after the same action, differs from the rollout's, or the
-      episode succeeds in the suite's own engine;
-    - *not reproducible*: the re-run succeeds, and the finding reports what differs;
-    - *perception*: the policy was shown wrong observations; *query*: it acted on wrong answers; and it succeeds with
-      the true ones;
-    - *actuation* or *gripper*: something around the policy or the environment changed the motion or the gripper's
-      command, beyond the noise. If this happened in only one plan step, the cause is *skill*.
-
-    **Replacements decide about what is left.** Scripts take control of the whole policy. If they succeed, the plan is
-    sound, and the scripts' actions show what the policy does differently: the *gripper*, the motion in one plan step
-    (*skill*) or in all (*actuation*). Scripts for only this part must succeed too, otherwise the cause is *policy*. If
-    they fail, the reference *plan* is tried, then twice the time (*out of time*), then pairs, which give ``cause`` and
-    ``also``. If the episode succeeds without noise, and this repairs about as many of the task's failed episodes as
-    the best replacement, no part is blamed, but the *noise*.
+    **Replacements decide the remaining cases**. The episode is re-run without noise, with scripts instead of the policy
+    or a part of it, with the reference plan, with twice the time, and with two parts replaced, which are reported as
+    ``cause`` and ``also``. docs/why-did-it-fail.md lists each measurement and replacement with its cause.
 
     Args:
         rollouts: episodes as :func:`evaluate` passes them to ``on_episode``, or TensorDicts of batch (T,), each with
             one whole episode; successful episodes are skipped. Keys: ``observation`` (T, 39) float32, ``task_id`` (T,)
-            int64, ``("next", "success")`` (T, 1) bool, and, in a TensorDict, ``episode`` (T,) int64. Optional: the
-            answers that the policy acted on, ``qaf_logits`` (T, S) float32 or ``qaf`` (T, S) bool; and
-            ``skill_weights`` (T, S) float32, which determine the active plan step.
+            int64, ``("next", "success")`` (T, 1) bool, and, in a TensorDict, ``episode`` (T,) int64. Optional:
+            ``("next", "executed_action")`` or, if that is absent, ``action`` (T, 4) float32.
         plans: the plans that the policy followed.
         actor: the policy; re-runs of a stochastic policy are less reliable.
         reference: trusted plans for some of the tasks.
@@ -116,8 +99,8 @@ def attribute_failures(
         >>> skills, text = lw.load_skills(), plans["reach"].steps[1].skill
         >>> faulty = {**skills, text: replace(skills[text], offset=(0.1, 0.0, 0.0))}
         >>> actor, episodes = lw.ScriptedSkillActor(plans, skills=faulty), []
-        >>> run, keys = {"seed": 1_000, "max_steps": 100}, ["observation", "task_id", "qaf", "skill_weights"]
-        >>> record = {"also_record": keys, "on_episode": episodes.append}
+        >>> run = {"seed": 1_000, "max_steps": 100}
+        >>> record = {"also_record": ["observation", "task_id"], "on_episode": episodes.append}
         >>> _ = lw.evaluate(actor, tasks="reach", episodes_per_task=1, **run, **record)
         >>> [failure] = attribute_failures(episodes, plans, actor=actor, **run)
         >>> failure.cause, failure.counterfactuals
@@ -126,162 +109,145 @@ def attribute_failures(
     Source: a plan's conditions, skills and skill execution are separate in the policy, so each can be replaced.
     """
     answered = as_plans(plans)
-    if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
+    if (own := plans_of(actor)) is not None and (other := answered.differences(own)):
         raise ValueError(f"plans differ from the actor's plans for {', '.join(other)}; pass the actor's plans")
     failed = _failed(rollouts, answered)
     if not failed:
         return []
-    names = sorted({task for task, _, _ in failed})
+    names = sorted({task for task, _ in failed})
     own_suite = find_suite(names, suite)
-    table = (own_suite.skills or load_skills()) if skills is None else skills
-    all_trusted = {} if reference is None else as_plans(reference, "reference")
-    trusted = {task: plan for task, plan in all_trusted.items() if task in names}
-    seen = [states_of(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
-    scripts, trusted_scripts = Scripts(answered, table), Scripts(Plans(trusted), table) if trusted else None
-    explained = [(states, explain(states, scripts, trusted_scripts)) for states in seen]
-    if actor is None:
-        return [
-            Failure(states.task, seed, states.episode, cause, None, *blames[cause], evidence=evidence)
-            for states, (cause, blames, evidence) in explained
-        ]
+    scripts = Scripts(answered, (own_suite.skills or load_skills()) if skills is None else skills)
+    trusted = None if reference is None else as_plans(reference, "reference")
     tasks = {name: own_suite.tasks.get(name, answered[name].definition) for name in names}
-    env_options = {"seed": seed, "suite": own_suite, "engine": engine, "num_threads": num_threads}
-    env_options["max_steps"] = own_suite.max_steps if max_steps is None else max_steps
-    rerun = Rerun(tasks, env_options, noise_scale, num_envs, device, progress)
-    reruns = Reruns(actor, evaluator, scripts, Plans(trusted) if trusted else None, rerun, {s.which: s for s in seen})
-    reruns.run()
-    shares = reruns.shares()
-    return [_by_reruns(*both, reruns, shares[both[0].task], seed) for both in explained]
+    env_options = {"seed": seed, "suite": own_suite, "num_threads": num_threads}
+    settings = Settings(actor, evaluator, scripts, noise_scale, engine, max_steps or own_suite.max_steps)
+    reruns = Reruns(settings, trusted, tasks, env_options, num_envs, device, progress)
+    cases = reruns.run(failed)
+    shares = {task: shares_of([case for case in cases if case.task == task]) for task in names}
+    return [_verdict(case, reruns, shares[case.task], seed, len(failed[case.which])) for case in cases]
 
 
-def _failed(rollouts: Iterable[Any], plans: Plans) -> list[tuple[str, int, TensorDictBase]]:
-    """Return the task, the episode index and the time steps of each failed episode."""
+def _failed(rollouts: Iterable[Any], plans: Plans) -> dict[EpisodeId, TensorDictBase]:
+    """Return the time steps of each failed episode."""
     by_id = {task_id(task): task for task in plans}
-    failed: list[tuple[str, int, TensorDictBase]] = []
-    seen: set[EpisodeId] = set()
+    episodes: dict[EpisodeId, TensorDictBase] = {}
     for place, rollout in enumerate(rollouts):
         name = f"rollouts[{place}]"
         steps, number = (rollout.steps, rollout.episode) if isinstance(rollout, FinishedEpisode) else (rollout, None)
         if not isinstance(steps, TensorDictBase) or steps.batch_dims != 1 or not len(steps):
             got = type(steps).__name__
-            raise ValueError(f"{name} must be a finished episode, or a non-empty TensorDict of batch (T,), got {got}")
+            raise ValueError(f"{name} must be a finished episode, or a TensorDict of batch (T,), got {got}")
         needed = ["observation", "task_id", ("next", "success"), *(["episode"] if number is None else [])]
         if missing := [str(key) for key in needed if steps.get(key, None) is None]:
             raise missing_keys(steps.keys(True, True), *missing)
         tasks = steps.get("task_id").unique().tolist()
         if len(tasks) != 1 or tasks[0] not in by_id:
-            raise ValueError(f"{name} must be of exactly one task in plans ({', '.join(plans)}), got task_id {tasks}")
-        episodes = steps.get("episode").unique().tolist() if number is None else [number]
-        if len(episodes) != 1:
-            raise ValueError(f"{name} must hold one episode, got {len(episodes)} episodes; pass one rollout for each")
-        which = by_id[tasks[0]], episodes[0]
-        if which in seen:
+            raise ValueError(f"{name} must have one task_id, of {', '.join(plans)}, got task_id {tasks}")
+        numbers = steps.get("episode").unique().tolist() if number is None else [number]
+        if len(numbers) != 1:
+            raise ValueError(f"{name} must hold one episode, got {len(numbers)} episodes; pass one rollout for each")
+        which = by_id[tasks[0]], numbers[0]
+        if which in episodes:
             raise ValueError(f"{name} repeats episode {which[1]} of {which[0]!r}; pass each episode once")
-        seen.add(which)
-        if not steps.get(("next", "success")).any():
-            failed.append((*which, steps))
-    return failed
+        episodes[which] = steps
+    return {which: steps for which, steps in episodes.items() if not steps.get(("next", "success")).any()}
 
 
-def _answers(steps: TensorDictBase, actor: Any) -> Tensor | None:
-    """Return the answers (T, S) bool of a policy's evaluators, averaged over their logits; None without evaluator."""
-    evaluators = own_evaluators(actor)
-    if not evaluators or "qaf_logits" in steps.keys():
-        return None
-    keys = dict.fromkeys(key for evaluator in evaluators for key in evaluator.in_keys)
-    if missing := ", ".join(str(key) for key in keys if steps.get(key, None) is None):
-        needed = f"rollouts must hold {missing}, which the policy's evaluator reads, or the evaluator's qaf_logits"
-        raise ValueError(f"{needed}; evaluate(..., attribute=True) records them")
-    with torch.no_grad(), evaluating(actor):
-        device = device_of(actor)
-        logits = [each.logits(*(steps.get(key).to(device) for key in each.in_keys)) for each in evaluators]
-    return torch.stack(logits).mean(0).cpu() > 0
-
-
-def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
-    """Return the keys that attribution reads from each time step: the required ones, and the actor's input keys."""
-    written = set(env.full_observation_spec.keys(True, True))
-    keys = [key for key in getattr(actor, "in_keys", ()) if key in written]
-    return ["observation", "task_id", "qaf", *keys, "skill_weights", "qaf_logits"]
-
-
-def _by_reruns(
-    seen: EpisodeStates, explanation: Explanation, reruns: Reruns, shares: Mapping[str, float], seed: int
-) -> Failure:
-    """Return the failure with the cause found by the re-runs, and the finding that shows it."""
-    which, known = seen.which, {"shares": dict(shares)}
-    number = float(sum(task == seen.task for task, _ in reruns.seen))
-    record: dict[str, Any] = known | {"evidence": {**explanation.evidence, "failed": number}}
-    differs, again = reruns.differs.get(which), reruns.plain[which].first_success
-    if reruns.fails_elsewhere(which) or (differs is not None and shares["nothing"] >= MARGIN):
-        first = differs or Difference("nothing", len(seen.steps) - 1)
-        cause: Cause = "environment differs" if reruns.environment_differs(which) else "not reproducible"
-        return Failure(seen.task, seed, seen.episode, cause, None, None, first.at, first, succeeds_at=again, **record)
-    record["counterfactuals"] = tried = {
-        name: results[which] is not None for name, results in reruns.results.items() if which in results
-    }
+def _verdict(case: FailedEpisode, reruns: Reruns, shares: Mapping[str, float], seed: int, length: int) -> Failure:
+    """Return an episode's failure with its cause, as determined by the re-runs, and the finding that shows it."""
+    record: dict[str, Any] = {"task": case.task, "seed": seed, "episode": case.plain.episode, "shares": dict(shares)}
+    if case.fails_elsewhere or (case.differs is not None and shares["nothing"] >= MARGIN):
+        at = length - 1 if case.differs is None else int(case.differs.values["at"])
+        record["cause"] = "environment differs" if case.environment_differs else "not reproducible"
+        record |= {"also": None, "step": None, "finding": case.differs}
+        return Failure(**record, at=at, succeeds_at=case.plain.first_success)
+    scripts, trusted, compared = reruns.settings.scripts, reruns.trusted, None
+    if trusted is not None and case.task in trusted.scripts.plans:
+        compared = departures(case, scripts, trusted.scripts)
+    record["evidence"] = evidence = _evidence(case, scripts, compared)
+    record["counterfactuals"] = tried = {name: episode is not None for name, episode in case.results.items()}
     # If both plans request the same actions, a success with the reference is not due to the reference's content.
-    same = explanation.evidence.get("plan_departs") == 0.0
-    mended = [name for name, success in tried.items() if success and not (same and name == "plan")]
-    cause, also, by = decide(mended, shares)
-    step, motion = reruns.step.get(which), None
-    # Changed actions are a fact, so they are to blame even if the episode also fails without the change.
-    found = _wrong_motion(reruns, which, "decided", by), _wrong_motion(reruns, which, "commanded", by)
-    measured = [each for each in found if each[1] is not None]
-    if measured and by not in ("environment", "perception", "query"):
-        cause, motion, step = max(measured, key=lambda each: each[1].error if each[1] else 0.0)
+    same = evidence.get("plan_departs") == 0.0
+    cause, also, by = decide([name for name in tried if case.is_fixed(name) and not (same and name == "plan")], shares)
+    step, motion, gripper = case.step, None, reruns.gripper
+    # A measured change of the actions is the cause even if the episode also fails without the change.
+    changes = [_wrong_motion(case, name, gripper, by) for name in ("wrapped action", "executed action")]
+    if any(changes) and not (by or "").startswith(("environment", "perception", "query")):
+        cause, motion, step = max(filter(None, changes), key=lambda change: float(change[1].values["error"]))
         by, also = "wrapper" if by == "wrapper" else None, None
-    elif by in ("gripper", "actuation"):
-        motion = _wrong_motion(reruns, which, "scripted", by)[1]
-    elif cause == "undecided" and explanation.cause == "query" and "query" not in tried:
-        cause = "query"  # wrong answers are a fact, even if they could not be replaced
-    elif cause == "undecided" and which in reruns.misled and reruns.misled[which].error > _SEEN:
+    elif by in ("gripper", "actuation") and (change := _wrong_motion(case, "policy's action", gripper, by)):
+        motion = change[1]
+    elif cause == "undecided" and case.answers_wrong >= (OFTEN_WRONG if "query" in tried else WRONG):
+        cause = "query"  # the answers were measured to be wrong, even if replacing them was impossible or not enough
+    elif cause == "undecided" and case.misled is not None and float(case.misled.values["error"]) > _SEEN:
         cause = "perception"
-    if (episode := reruns.mended(by, which)) is not None:
+    if by is not None and (episode := case.results[by]) is not None:
         record |= {"replaced": by, "succeeds_at": len(episode.steps), "mended": episode}
-    finding: Finding | None
-    place, at, finding = explanation.blames.get(cause, explanation.blames["undecided"])
-    if cause == "skill" and also is None and step is not None:
-        plan = reruns.scripts.plans[seen.task]
-        place, at, finding = step, stall_step(seen, step, plan.definition.layout), seen.active_time(plan, step)
-    elif cause == "perception":
-        finding = reruns.misled[which]
-    elif cause == "undecided" and explanation.cause != "undecided":
-        record["suspect"], finding = explanation.cause, explanation.blames[explanation.cause].finding
-    elif motion is not None:
-        finding = motion
-    planless = plans_of(reruns.actor) is None and cause != "query"
-    finding = finding if not planless or isinstance(finding, Misled | WrongMotion) else None
-    return Failure(seen.task, seed, seen.episode, cause, also, None if planless else place, at, finding, **record)
+    place, at, finding = _blame(case, cause, scripts, compared, step if also is None else None)
+    at = min(at, length - 1)  # the rollout may be shorter than its re-run
+    changed = case.misled if cause == "perception" else None if cause == "skill" else motion
+    if plans_of(reruns.settings.actor) is None and cause != "query":
+        return Failure(**record, cause=cause, also=also, step=None, at=at, finding=changed)
+    return Failure(**record, cause=cause, also=also, step=place, at=at, finding=changed or finding)
+
+
+def _blame(case: FailedEpisode, cause: Cause, scripts: Scripts, compared: Departures | None, step: int | None) -> Blame:
+    """Return the plan step, the state and the finding that show a cause."""
+    if cause == "query":
+        return blame_answers(case)
+    if cause == "plan" and compared is not None and compared.departs.any():
+        return blame_plan(case, compared)
+    stuck = blame_step(case, scripts, step if cause == "skill" and step is not None else last_active_step(case))
+    return stuck._replace(at=len(case.active) - 1) if cause == "out of time" else stuck
+
+
+def _evidence(case: FailedEpisode, scripts: Scripts, compared: Departures | None) -> dict[str, float]:
+    """Return numbers, by name, that were measured in the states or show why a success may not be due to the plan.
+
+    "expert_steps" is the number of plan steps without a scripted skill, in which Meta-World's expert acts;
+    "generic_plan" is 1 if the policy follows the generic plan, "not_understood" if no step of the plan could be parsed.
+    """
+    plan, unscripted = case.plan, scripts.skills[case.task].count(None)
+    uncovered = (~case.truth.any(-1))[-case.late :]
+    evidence = {"answers_wrong": case.answers_wrong, "no_condition_late": float(uncovered.float().mean())}
+    if compared is not None:
+        evidence["plan_departs"] = float(compared.departs.float().mean())
+    if [s for s in plan.steps if not (s.role and s.role.fallback)] == list(fallback_plan(plan.definition).steps):
+        evidence["generic_plan"] = 1.0
+    if unscripted and case.task in TASKS:
+        evidence["expert_steps"] = float(unscripted)
+        if plan.steps[0].role is None and explain_canonical(plan).source == "fallback":
+            evidence["not_understood"] = 1.0
+    return evidence
 
 
 def _wrong_motion(
-    reruns: Reruns, which: EpisodeId, right: Literal["decided", "commanded", "scripted"], by: str | None = None
-) -> tuple[Cause, WrongMotion | None, int | None]:
-    """Return the part of the action that differs from the right action, the finding, and its plan step if only one."""
-    compared = {"decided": reruns.wrapped, "commanded": reruns.executed, "scripted": reruns.scripted}[right]
-    if (motion := compared.get(which)) is None:
-        return "undecided", None, None
-    gripper = gripper_of(reruns.scripts.plans)
+    case: FailedEpisode, kind: str, gripper: Tensor, by: str | None
+) -> tuple[Cause, Finding, int | None] | None:
+    """Return the cause of a wrong gripper or hand motion, the finding, and the plan step (None for several steps)."""
+    by_kind = {"wrapped action": case.wrapped, "executed action": case.executed, "policy's action": case.scripted}
+    if (motion := by_kind[kind]) is None:
+        return None
     hand, fingers = motion.of(~gripper), motion.of(gripper)
     part = fingers if by == "gripper" or (by != "actuation" and fingers.error() > 4 * hand.error()) else hand
-    if part.error() < (0.0 if by == "wrapper" or right == "scripted" else _CLEAR):
-        return "undecided", None, None
-    in_all, worst, shape = part.extent(exact=right != "scripted")
-    errors = part.errors()
-    steps = sum(error > 0.1 * max(errors.values()) for error in errors.values())
-    name: Literal["gripper", "motion"] = "gripper" if part is fingers else "motion"
-    finding = WrongMotion(name, right, shape, part.error(), steps)
+    is_exact = kind != "policy's action"
+    if is_exact and by != "wrapper" and part.error() < _CLEAR:
+        return None
+    in_all, worst, shape = part.extent(exact=is_exact)
+    errors = part.errors().values()
+    steps = sum(error > 0.1 * max(errors) for error in errors)
+    name = "gripper's command" if part is fingers else "hand's motion"
+    values: dict[str, Any] = {"part": name, "shape": shape, "error": part.error(), "steps": steps, "of": len(errors)}
     if part is fingers:
-        return "gripper", finding, None
-    return ("skill", finding, worst) if in_all is False else ("actuation", finding, None)
+        return "gripper", Finding(kind, values), None
+    return ("skill", Finding(kind, values), worst) if in_all is False else ("actuation", Finding(kind, values), None)
 
 
 def decide(mended: Collection[str], shares: Mapping[str, float]) -> tuple[Cause, Cause | None, str | None]:
     """Decide the cause of a failed episode from the replacements with which the episode succeeds (``mended``).
 
-    ``shares`` is, for each replacement, the fraction of the task's failed episodes it was tried on that it fixes, and
-    for "nothing" the fraction that a plain re-run fixes. Return a cause, a second cause, and the deciding replacement.
+    ``shares`` maps each replacement to the fraction of episodes that it fixes, among the task's failed episodes on
+    which it was tried; "nothing" is the plain re-run. Return a cause, a second cause, and the deciding replacement.
 
     Measured errors come first, if correcting them helps. Then comes the smallest part of the policy whose replacement
     by scripts helps: a skill in one plan step, the gripper or the motion (of these two, the one that fixes more).
@@ -292,7 +258,7 @@ def decide(mended: Collection[str], shares: Mapping[str, float]) -> tuple[Cause,
     fixes = {name: shares.get(name, 1.0) for name in mended}
     if facts := [name for name in _FACTS if name in fixes]:
         best = max(facts, key=fixes.__getitem__)
-        return REPLACEMENTS[best][0], None, best
+        return REPLACEMENTS[best]["causes"][0], None, best
     if best := next((name for name in _PARTS if name in fixes), ""):
         if best == "gripper" and "actuation" in fixes:
             best = max(("gripper", "actuation"), key=fixes.__getitem__)
@@ -300,9 +266,10 @@ def decide(mended: Collection[str], shares: Mapping[str, float]) -> tuple[Cause,
                 return "policy", None, best
         if fixes[best] >= fixes.get("no noise", -1.0) + MARGIN:
             clear = fixes[best] >= shares.get("nothing", 0.0) + MARGIN
-            return REPLACEMENTS[best][0] if clear else "policy", None, best
+            return REPLACEMENTS[best]["causes"][0] if clear else "policy", None, best
     for name in ("no noise", "time"):
         if name in fixes:
-            return REPLACEMENTS[name][0], None, name
-    pair = next((name for name in mended if len(REPLACEMENTS[name]) > 1), None)
-    return ("undecided", None, None) if pair is None else (REPLACEMENTS[pair][0], REPLACEMENTS[pair][1], pair)
+            return REPLACEMENTS[name]["causes"][0], None, name
+    pair = next((name for name in mended if " + " in name), None)
+    cause, also = ("undecided", None) if pair is None else REPLACEMENTS[pair]["causes"]
+    return cause, also, pair

@@ -1,169 +1,58 @@
-"""Failure: why one episode failed, as typed data: a cause, a finding, and the results of re-runs."""
+"""Failure: why one episode failed, as typed data and in English: a cause, a finding, and the results of re-runs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from importlib.resources import files
+from typing import Annotated, Any, Literal, NamedTuple
 
 from beartype.vale import Is
 from tensordict import TensorDictBase
 
-from lw_torchrl._util.checks import Count, Natural, Scale, shown, typed_fields
+from lw_torchrl._util.checks import Count, Finite, Natural, counted, shown, typed_fields
+from lw_torchrl._util.files import read_toml
 from lw_torchrl.language.plans import ConditionalPlan
 
-Blamed = Literal["perception", "query", "plan", "skill", "gripper", "actuation", "policy"]
-Cause = Literal["environment differs", "not reproducible", Blamed, "noise", "out of time", "undecided"]
-
-CAUSES: dict[str, str] = {
-    "environment differs": "the environment differs from that of the re-run, or from the suite's",
-    "not reproducible": "a plain re-run succeeds",
-    "perception": "the policy received a wrong observation",
-    "query": "a condition was answered wrongly",
-    "plan": "the plan is wrong",
-    "skill": "the policy executed a skill badly",
-    "gripper": "the gripper opened or closed wrongly",
-    "actuation": "the hand moved wrongly in several steps",
-    "policy": "the policy acted wrongly, unclear which part",
-    "noise": "the action noise, not a part of the policy",
-    "out of time": "the episode succeeds with more time",
-    "undecided": "no replacement helps",
-}
+_TABLES = read_toml(files("lw_torchrl.evaluation") / "data" / "causes.toml", ValueError)
+CAUSES: dict[str, str] = {cause: meaning for cause, (meaning, _) in _TABLES["causes"].items()}
 """A mapping from each cause to its meaning."""
+CAUSE_COLORS: dict[str, str] = {cause: color for cause, (_, color) in _TABLES["causes"].items()}
+FINDINGS: dict[str, str] = _TABLES["findings"]
+REPLACEMENTS: dict[str, dict[str, list[str]]] = _TABLES["replacements"]
+"""A mapping from the name of each replacement to its causes, and to the parts that it inserts and removes."""
+_SCRIPTED = {"skill", "gripper", "actuation", "policy"}  # the replacements in which scripts act
 
-REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
-    "environment": ("environment differs",),
-    "perception": ("perception",),
-    "query": ("query",),
-    "wrapper": ("actuation",),
-    "plan": ("plan",),
-    "skill": ("skill",),
-    "gripper": ("gripper",),
-    "actuation": ("actuation",),
-    "policy": ("policy",),
-    "no noise": ("noise",),
-    "time": ("out of time",),
-    "query + skill": ("query", "skill"),
-    "query + plan": ("query", "plan"),
-    "plan + skill": ("plan", "skill"),
-}
-"""A mapping from each replacement to the causes to blame if an episode succeeds with that replacement.
-
-For "wrapper", the cause is "skill" or "gripper" if the wrapper changes only these.
-"""
-
-Finite = Annotated[float, Is[lambda x: abs(x) < 1e300]]
-_Replacement = Annotated[str, Is[lambda name: name in REPLACEMENTS]]
-# beartype checks only one entry of a mapping; these annotations check all entries.
-_Numbers = Annotated[
-    Mapping[str, Finite], Is[lambda table: all(type(x) in (int, float) and abs(x) < 1e300 for x in table.values())]
-]
-_Tried = Annotated[
-    Mapping[str, bool], Is[lambda table: {*table} <= {*REPLACEMENTS} and all(type(x) is bool for x in table.values())]
-]
+Cause = Annotated[str, Is[lambda name: name in CAUSES]]
+_FindingKind = Annotated[str, Is[lambda name: name in FINDINGS]]
+_ReplacementName = Annotated[str, Is[lambda name: name in REPLACEMENTS]]
 
 
 @typed_fields
 @dataclass(frozen=True)
-class WrongAnswers:
-    """A finding that a plan step's condition was evaluated wrongly.
+class Finding:
+    """What the re-run of a failed episode shows: a kind in data/causes.toml, and the values in the kind's text."""
 
-    The evaluation is wrong in ``states`` out of ``of`` states, first at ``first``.
-    """
+    kind: _FindingKind
+    values: Mapping[str, str | Finite]
 
-    step: Natural
-    condition: str
-    states: Natural
-    of: Count
-    first: Natural
+    def __post_init__(self) -> None:
+        try:
+            _ = self.text
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"values must be those of a finding {self.kind!r}, got {shown(self.values)}") from error
 
-
-@typed_fields
-@dataclass(frozen=True)
-class NoCondition:
-    """A finding: no condition of the plan held in ``states`` of the last ``of`` states."""
-
-    states: Natural
-    of: Count
-
-
-@typed_fields
-@dataclass(frozen=True)
-class PlanDeparts:
-    """A finding: plan and reference requested different actions in ``states`` of ``of`` states (last if ``late``)."""
-
-    step: Natural  # the active plan step in most of these states
-    skill: str
-    reference: str  # the skill that the reference requests there
-    states: Natural
-    of: Count
-    late: bool
-    uncovered: bool  # whether no condition of the plan held in most of these states
-
-
-@typed_fields
-@dataclass(frozen=True)
-class ActiveStep:
-    """A finding: a plan step was active in ``states`` of the last ``of`` states, ``distance`` m from its target."""
-
-    step: Natural
-    skill: str
-    states: Natural
-    of: Count
-    distance: Scale | None = None
-
-
-@typed_fields
-@dataclass(frozen=True)
-class Misled:
-    """A finding: the policy's observation differed from the true one, by up to ``error`` in entry ``number``."""
-
-    error: Scale
-    number: Natural
-
-
-@typed_fields
-@dataclass(frozen=True)
-class WrongMotion:
-    """A finding: in plan steps ``steps``, the action differed by ``error`` (root mean square) from the right one.
-
-    ``right`` is the action to compare with: the "decided" one (the action of the policy's innermost module, which a
-    wrapper changed), the "commanded" one (the policy's action, which the environment executed differently), or the
-    "scripted" one (a trusted skill's). ``shape`` is the simplest fault that explains the error.
-    """
-
-    part: Literal["motion", "gripper"]
-    right: Literal["decided", "commanded", "scripted"]
-    shape: str  # "constant", "scaled", "shifted", "delayed by 3", "turned" or "irregular"
-    error: Scale
-    steps: int  # the number of plan steps with this error
-
-
-@typed_fields
-@dataclass(frozen=True)
-class Difference:
-    """A finding: the first difference between the rollout and the plain re-run of an episode, in state ``at``.
-
-    ``part`` is "length" if the numbers of time steps differ (``given`` and ``again``), "actions" if the executed
-    actions differ (by ``size``), "environment" if the same action leads to different states, "states" if the states
-    differ and the rollout has no actions, or "nothing" if no recorded data differ.
-    """
-
-    part: Literal["length", "actions", "environment", "states", "nothing"]
-    at: Natural
-    given: Natural | None = None
-    again: Natural | None = None
-    size: Scale | None = None
-
-
-Finding = WrongAnswers | NoCondition | PlanDeparts | ActiveStep | Misled | WrongMotion | Difference
-_FINDINGS = {kind.__name__: kind for kind in get_args(Finding)}
+    @property
+    def text(self) -> str:
+        """The finding as a clause. Plan steps count from 0 in the values, and from 1 in the text."""
+        number = int(self.values.get("step", 0)) + 1
+        return FINDINGS[self.kind].format_map({**self.values, "number": number})
 
 
 class MendedEpisode(NamedTuple):
     """A successful re-run of a failed episode with one part replaced.
 
-    ``steps`` has batch (T,) up to the first success: ``observation``, the executed ``action``, ``task_id``,
+    ``steps``, batch (T,), ends at the first success. Keys: ``observation``, the executed ``action``, ``task_id``,
     ``episode``, ``("next", "success")``, ``("next", "reward")`` and, if recorded, ``qaf`` and ``skill_weights``.
     """
 
@@ -183,10 +72,9 @@ class Failure:
         also: a second cause, if the episode succeeds only with both replaced.
         step: the plan step to which the failure belongs (0-based); None if it belongs to no plan step.
         at: the time step of the episode to look at first (0-based).
-        finding: what the episode's states show about ``cause``, or about ``suspect``.
+        finding: what the episode's states show about ``cause``.
         replaced: the replacement that decided the cause, one of :data:`REPLACEMENTS`; None if no replacement did.
         succeeds_at: the time step at which the episode succeeds with ``replaced``, or in a plain re-run.
-        suspect: the cause that the states alone suggest, if ``cause`` is "undecided".
         evidence: numbers measured in the episode's states, by name.
         counterfactuals: for each replacement that was tried (see :func:`attribute_failures`), whether the episode
             succeeded with it. A pair such as "query + plan" replaces both; in a pair, "skill" means all plan steps.
@@ -203,12 +91,11 @@ class Failure:
     step: Natural | None
     at: Natural
     finding: Finding | None = None
-    replaced: _Replacement | None = None
+    replaced: _ReplacementName | None = None
     succeeds_at: Count | None = None
-    suspect: Cause | None = None
-    evidence: _Numbers = field(default_factory=dict)
-    counterfactuals: _Tried = field(default_factory=dict)
-    shares: _Numbers = field(default_factory=dict)
+    evidence: Mapping[str, Finite] = field(default_factory=dict)
+    counterfactuals: Mapping[_ReplacementName, bool] = field(default_factory=dict)
+    shares: Mapping[str, Finite] = field(default_factory=dict)
     mended: MendedEpisode | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -218,38 +105,76 @@ class Failure:
     @property
     def why(self) -> str:
         """The reason for the failure in a few English sentences."""
-        from lw_torchrl.evaluation.diagnose.sentences import explain_failure  # avoids a circular import
+        texts = [] if self.finding is None else [self.finding.text]
+        if self.cause in ("environment differs", "not reproducible"):
+            others = "" if self.cause == "environment differs" else ", and other episodes of the task succeed"
+            ending = f"fails in a different way{others}" if self.succeeds_at is None else "succeeds"
+            texts.insert(0, f"a plain re-run {ending}")
+        elif self.shares:
+            texts += [self._text_of_reruns(), self._text_of_plan()]
+        return " ".join(f"{text[0].upper()}{text[1:]}." for text in texts if text)
 
-        return explain_failure(self)
+    def _text_of_reruns(self) -> str:
+        """Describe the results of re-running the episode in a clause."""
+        if self.replaced is not None and self.also is not None:
+            first, second = REPLACEMENTS[self.replaced]["inserted"]
+            return f"with {first} the episode fails, and with {second} as well it succeeds"
+        if self.replaced is not None:
+            return self._text_of_success(self.replaced)
+        if self.counterfactuals.get("plan"):
+            return "the episode succeeds with the reference plan, but both plans request the same action in every state"
+        if self.cause == "query" and "query" not in self.counterfactuals:
+            return "these answers could not be replaced"
+        if self.counterfactuals:
+            *texts, last = map(replacement_text, self.counterfactuals)
+            return f"the episode also fails with {' or with '.join([*filter(None, [', '.join(texts)]), last])}"
+        return "no part of the policy could be replaced"
+
+    def _text_of_success(self, name: str) -> str:
+        """Name the replacement that helps and the fractions of failed episodes that re-runs fix, in a clause."""
+        expert = self.evidence.get("expert_steps", 0.0) if name in _SCRIPTED else 0.0
+        others = f" (Meta-World's expert in {counted(int(expert), 'step')} without a scripted skill)" if expert else ""
+        shares = [f"this fixes {self.shares.get(name, 1.0):.0%} of the task's failed episodes"]
+        if name != "no noise" and "no noise" in self.shares:
+            shares.append(f"a re-run without noise {self.shares['no noise']:.0%}")
+        shares.append(f"a plain re-run {self.shares.get('nothing', 0.0):.0%}")
+        success = f"the same episode succeeds, at t = {self.succeeds_at}"
+        return f"with {replacement_text(name)}{others} {success}; {', '.join(shares)}"
+
+    def _text_of_plan(self) -> str:
+        """Return a clause if the success of a re-run does not show that the plan is sound, otherwise ""."""
+        is_scripted = not _SCRIPTED.isdisjoint((self.replaced or "").split(" + "))
+        if "generic_plan" in self.evidence:
+            succeeds = "; the generic plan succeeds" if is_scripted else ", so the policy follows the generic plan"
+            return f"the plan's steps are not understood{succeeds}"
+        if is_scripted and "expert_steps" in self.evidence:
+            unread = "the plan's steps are not understood, and " if "not_understood" in self.evidence else ""
+            return f"{unread}the expert does not follow the plan, so this does not show that the plan is sound"
+        return ""
 
     def to_json(self) -> dict[str, Any]:
-        """Return all fields except :attr:`mended`, as JSON."""
-        content = {each.name: getattr(self, each.name) for each in fields(self) if each.compare}
-        if self.finding is not None:
-            content["finding"] = {"kind": type(self.finding).__name__, **vars(self.finding)}
-        return content
+        """Return all fields except :attr:`mended`, and :attr:`why`, as JSON."""
+        content = {each.name: getattr(self, each.name) for each in fields(self) if each.compare} | {"why": self.why}
+        return content if self.finding is None else {**content, "finding": vars(self.finding)}
 
     @classmethod
     def from_json(cls, content: Any) -> Failure:
         """Rebuild a failure from the result of :meth:`to_json`; raise :class:`ValueError` for any other JSON."""
-        stated = content.get("finding") if isinstance(content, dict) else None
-        if isinstance(stated, dict):
-            kind = _FINDINGS.get(str(stated.get("kind")))
-            if kind is None:
-                raise ValueError(f"finding must be one of {', '.join(_FINDINGS)}, got {shown(stated)}")
-            try:
-                finding = record_from_json(kind, {name: stated[name] for name in stated if name != "kind"})
-            except ValueError as error:
-                raise ValueError(f"finding: {error}") from None
-            content = {**content, "finding": finding}
+        if isinstance(content, dict):
+            content = {key: value for key, value in content.items() if key != "why"}
+            if content.get("finding") is not None:
+                content["finding"] = record_from_json(Finding, content["finding"])
         failure: Failure = record_from_json(cls, content)
         return failure
 
 
+def replacement_text(name: str, parts: Literal["inserted", "removed"] = "inserted") -> str:
+    """Return the parts that a replacement inserts or removes, for example "the true answers and scripted skills"."""
+    return " and ".join(REPLACEMENTS[name][parts])
+
+
 def record_from_json(kind: type[Any], content: Any) -> Any:
-    """Build an instance of the dataclass ``kind`` from a JSON object. Its keys must be exactly the fields of ``kind``
-    with ``compare=True``.
-    """
+    """Build the dataclass ``kind`` from a JSON object, whose keys must be exactly the fields with ``compare=True``."""
     names = {each.name for each in fields(kind) if each.compare}
     if not isinstance(content, dict) or set(content) != names:
         keys = ", ".join(sorted(names))

@@ -1,10 +1,9 @@
-"""Trusted parts that replace the parts of a policy, and a record of what the policy was shown and what it did."""
+"""Trusted parts that replace parts of a policy, and a wrapper that records the policy's observations and actions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from copy import deepcopy
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -12,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 from torch.nn.modules.module import register_module_forward_hook, register_module_forward_pre_hook
+from torch.nn.utils.rnn import pad_sequence
 
 from lw_torchrl._util.keys import write
 from lw_torchrl.language.objects import GRIPPER
@@ -26,63 +26,46 @@ from lw_torchrl.suites.metaworld.experts import ExpertActor
 
 EpisodeId = tuple[str, int]  # task and episode index
 TRUE_OBSERVATION = "true_observation"  # the environment's observation, before any transform or module changes it
-SHOWN, DECIDED, COMMANDED, SCRIPTED = "shown_observation", "decided_action", "commanded_action", "scripted_action"
+MEASURED = "measured"  # the key of what Control records
 _REST = ScriptedSkill("", GRIPPER, gain=(0.0, 0.0, 0.0))  # stands in for a plan step without a scripted skill
-_RULER = 1e-3  # gain (action per meter) to measure distances, so small that no action is clipped
-
-
-class TrueAnswers(QueryEvaluator):
-    """A query evaluator that keeps the environment's exact answers; its logits are 5 for true and -5 for false."""
-
-    def __init__(self, plans: Plans) -> None:
-        super().__init__(plans)
-        self.in_keys = ["qaf"]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        truth = tensordict.get("qaf")
-        return write(tensordict, self, [truth, 10.0 * truth.to(torch.float32) - 5.0])
-
-
-def own_evaluators(actor: Any) -> list[QueryEvaluator]:
-    """Return the query evaluators inside a policy, except evaluators nested in another evaluator."""
-    if isinstance(actor, QueryEvaluator):
-        return [actor]
-    children = actor.children() if isinstance(actor, nn.Module) else ()
-    return list(dict.fromkeys(evaluator for child in children for evaluator in own_evaluators(child)))
-
-
-def with_true_answers(actor: Any) -> Any:
-    """Return a copy of the policy with exact answers instead of its evaluators, or the policy if it has none."""
-    if not own_evaluators(actor):
-        return actor
-    other = deepcopy(actor)
-    for module in list(other.modules()):
-        for name, child in list(module.named_children()):
-            if isinstance(child, QueryEvaluator):
-                module._modules[name] = TrueAnswers(child.plans)
-    return other
 
 
 class Scripts:
     """The scripted skills for the steps of plans, looked up by skill text in ``table``."""
 
     def __init__(self, plans: Plans, table: Mapping[str, ScriptedSkill]) -> None:
-        self.plans, self.table = plans, table
-        self.known: dict[str, list[bool]] = {}  # for each task, whether each plan step has a scripted skill
-        skills: dict[Any, list[ScriptedSkill]] = {}
-        rulers: dict[Any, list[ScriptedSkill]] = {}
+        self.plans, self.table, self.tables = plans, table, PlanTables(plans)
+        self.skills: dict[str, list[ScriptedSkill | None]] = {}  # for each task; None for a step without a script
         for task, plan in plans.items():
-            listed = [table.get(step.skill) for step in plan.steps]
-            suitable = [s.for_task(plan.definition) if s and s.suits(plan.definition) else None for s in listed]
-            self.known[task] = [skill is not None for skill in suitable]
-            skills[plan.definition] = own = [skill or _REST for skill in suitable]
-            gains: list[Any] = [tuple(_RULER if gain else 0.0 for gain in skill.gain) for skill in own]
-            rulers[plan.definition] = [replace(s, gain=gain, variants={}) for s, gain in zip(own, gains, strict=True)]
-        self.program, self._ruler = SkillProgram(skills), SkillProgram(rulers)
+            owner, listed = plan.definition, [table.get(step.skill) for step in plan.steps]
+            self.skills[task] = [skill.for_task(owner) if skill and skill.suits(owner) else None for skill in listed]
+        self.program = SkillProgram({plans[t].definition: [s or _REST for s in own] for t, own in self.skills.items()})
+        # (tasks, S) bool, whether a step has a script
+        self.known = pad_sequence([self.has_script(task) for task in self.tables.index.tasks], batch_first=True)
 
-    def distance(self, observation: Tensor, task_id: Tensor, step: int) -> Tensor:
-        """Return the distance (T,) in meters between what a plan step's skill moves and the skill's target."""
-        return self._ruler(observation, task_id)[:, step, :3].norm(dim=-1) / _RULER
+    def has_script(self, task: str) -> Tensor:
+        """Return whether each step of a task's plan has a scripted skill, (S,) bool."""
+        return torch.tensor([skill is not None for skill in self.skills[task]])
+
+    def distance(self, task: str, step: int, observation: Tensor) -> float | None:
+        """Return the metres between what a plan step's skill moves and its target in a state (D,); None without one."""
+        if (skill := self.skills[task][step]) is None:
+            return None
+        positions = self.plans[task].definition.positions(observation)
+        error = positions[skill.target] + torch.tensor(skill.offset) - positions[skill.moved]
+        return float(error[torch.tensor(skill.gain) > 0].norm())
+
+
+def chosen(truth: Tensor, number: Tensor | int) -> Tensor:
+    """Return the first plan step (...) that is true in ``truth`` (..., S) bool, or the last of ``number`` steps."""
+    return torch.where(truth.any(-1), truth.int().argmax(-1), number - 1)
+
+
+def weights_of(written: TensorDictBase, truth: Tensor, number: Tensor | int) -> Tensor:
+    """Return a policy's attention (..., S) float32, or all attention on the chosen step if the policy wrote none."""
+    weights: Tensor | None = written.get("skill_weights", None)
+    steps = truth.shape[-1]
+    return one_hot(chosen(truth, number), steps).float() if weights is None else weights[..., :steps]
 
 
 def attended(weights: Tensor, steps: Tensor) -> Tensor:
@@ -98,16 +81,19 @@ def attended(weights: Tensor, steps: Tensor) -> Tensor:
 
 
 class Control(nn.Module):
-    """A policy that records what it is shown and what it does, and that trusted parts control if requested.
+    """Wrap a policy to record its observations and actions, and optionally replace parts of it by trusted parts.
 
-    It writes the observation at the input of the policy's innermost module (``SHOWN``), that module's action
-    (``DECIDED``; differs from the policy's own action, ``COMMANDED``, if a wrapper changes it), and the action of the
-    scripted skills, mixed by the policy's attention weights (``SCRIPTED``; NaN without active or scripted plan step).
+    Writes below the key "measured": "true", the environment's observation; "shown", the observation that the policy's
+    innermost module receives; "answered", the answers that the policy acts on; "decided", the innermost module's
+    action; "commanded", the policy's action, which differs if a wrapper changes it; and "scripted", the action of the
+    scripted skills, mixed by the policy's attention weights (NaN if no plan step is active or the active one has no
+    scripted skill).
 
     Args:
         actor: the policy.
         scripts: the scripted skills of the plans that the policy follows.
         correct: show the true observation to the innermost module.
+        answer: replace the answers of query evaluators inside the policy by the environment's exact answers.
         unwrap: execute the innermost module's action.
         part: the part of the action that scripts take over: "motion", "gripper" or "all"; None for no part. If no plan
             step is active, the policy's own action is kept. If the active step has no scripted skill, the expert acts.
@@ -119,48 +105,36 @@ class Control(nn.Module):
         actor: Callable[[TensorDictBase], TensorDictBase],
         scripts: Scripts,
         correct: bool = False,
+        answer: bool = False,
         unwrap: bool = False,
         part: str | None = None,
         steps: Mapping[EpisodeId, int] | None = None,
     ) -> None:
         super().__init__()
-        self.actor, self.scripts, self.correct, self.unwrap = actor, scripts, correct, unwrap
+        self.actor, self.scripts, self.correct, self.answer, self.unwrap = actor, scripts, correct, answer, unwrap
         self.row_by_row = bool(getattr(actor, "row_by_row", False))
-        plans = scripts.plans
-        self._tables = PlanTables(plans)
-        self._known = torch.zeros_like(self._tables.mask)
-        for row, task in enumerate(self._tables.index.tasks):
-            self._known[row, : len(plans[task].steps)] = torch.tensor(scripts.known[task])
         self._steps = None if steps is None else {(task_id(task), k): step for (task, k), step in steps.items()}
-        unscripted = [task for task, known in scripts.known.items() if not all(known) and task in TASKS]
+        unscripted = [task for task, skills in scripts.skills.items() if None in skills and task in TASKS]
         self._expert = ExpertActor(unscripted) if unscripted and part is not None else None
-        gripper = gripper_of(plans)
+        gripper = gripper_of(scripts.plans)
         self._taken = {None: gripper & ~gripper, "gripper": gripper, "motion": ~gripper}.get(part, gripper | True)
         self._innermost: dict[nn.Module, bool] = {}
-        self._calls: list[tuple[Tensor, Tensor]] = []  # what innermost modules were shown and decided
-        self._true: Tensor | None = None
-        self._shown = torch.empty(0)
-        self._inside: list[nn.Module] = []  # the innermost module while it runs
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        true, observation, task = (tensordict.get(key).clone() for key in (TRUE_OBSERVATION, "observation", "task_id"))
+        true, task = tensordict.get(TRUE_OBSERVATION).clone(), tensordict.get("task_id").clone()
         seen = tensordict.select("observation", "task_id", "episode", "_step", strict=False).clone()
-        self._true, self._calls = true, []
         if self.correct:
             tensordict.set("observation", true.clone())
-        hooks = [register_module_forward_pre_hook(self._correct), register_module_forward_hook(self._look)]
-        try:
+        with self._watching(true, tensordict.get("qaf").clone()) as (calls, answers):
             tensordict = self.actor(tensordict)
-        finally:
-            self._true, self._inside = None, []
-            for hook in hooks:
-                hook.remove()
         action = tensordict.get("action")
-        # The members of an ensemble decide together, so that no single one of their actions is to be executed.
-        shown, decided = self._calls[0] if self._calls else (observation, action)
-        decided = decided if len(self._calls) == 1 else action
+        # An ensemble has several innermost modules. None of their actions is meant to be executed by itself.
+        shown, decided = calls[0] if calls else (seen.get("observation"), action)
+        decided = decided if len(calls) == 1 else action
         weights, scripted, step = self._script(tensordict, seen.get("observation"), task)
-        tensordict.update({SHOWN: shown, DECIDED: decided, COMMANDED: action.clone(), SCRIPTED: scripted})
+        answered = torch.stack(answers).mean(0) if answers else tensordict.get("qaf").float()
+        measured = {"true": true, "shown": shown, "answered": answered, "decided": decided, "scripted": scripted}
+        tensordict.set(MEASURED, {**measured, "commanded": action.clone()})
         replaced = step >= 0
         if self._steps is not None:
             # Scripts take control where the plan step to replace in the row's episode has a noticeable weight.
@@ -177,45 +151,61 @@ class Control(nn.Module):
 
     def _script(self, written: TensorDictBase, observation: Tensor, task: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the weights (B, S) of the plan steps, the scripts' action (B, A), and the active plan step (B,)."""
-        rows = self._tables.rows(task)
-        mask, known = self._tables.mask.to(task.device)[rows], self._known.to(task.device)[rows]
-        weights = written.get("skill_weights", None)
-        if weights is None:  # put all the weight on the first plan step whose condition holds, otherwise on the last
-            truth = (written.get("qaf") > 0.5) & mask
-            first = torch.where(truth.any(-1), truth.int().argmax(-1), mask.sum(-1) - 1)
-            weights = one_hot(first, mask.shape[-1]).float()
+        rows = self.scripts.tables.rows(task)
+        mask, known = (table.to(task.device)[rows] for table in (self.scripts.tables.mask, self.scripts.known))
+        weights = weights_of(written, (written.get("qaf") > 0.5) & mask, mask.sum(-1))
         step = attended(weights, mask)
         unscripted = (step < 0) | ~known.gather(-1, step.clamp(min=0).unsqueeze(-1)).squeeze(-1)
         scripted = ((weights * known).unsqueeze(-1) * self.scripts.program(observation, task)).sum(-2)
         scripted = scripted.to(written.get("action").dtype)
         return weights, scripted.masked_fill(unscripted.unsqueeze(-1), torch.nan), step
 
-    def _watched(self, module: nn.Module, tensordict: Any) -> bool:
-        """Return whether a module is a whole policy: it acts, and it is our own or contains no other one that acts."""
-        if self._true is None or not isinstance(tensordict, TensorDictBase):
-            return False
+    @contextmanager
+    def _watching(self, true: Tensor, truth: Tensor) -> Iterator[tuple[list[tuple[Tensor, Tensor]], list[Tensor]]]:
+        """Collect the observation and the action of each innermost policy's call, and the answers of query evaluators.
+
+        Meanwhile, show the observation ``true`` and the answers ``truth`` instead of other ones where requested.
+        """
+        calls: list[tuple[Tensor, Tensor]] = []
+        answers: list[Tensor] = []
+        running: list[tuple[nn.Module, Tensor]] = []  # the innermost policy while it runs, and its observation
+
+        def before(module: nn.Module, args: tuple[Any, ...]) -> None:
+            seen = args[0] if args else None
+            if running or not isinstance(seen, TensorDictBase) or not self._is_innermost(module):
+                return
+            shown = seen.get("observation", None)
+            if shown is not None and shown.shape == true.shape:
+                running.append((module, shown.clone()))
+                if self.correct:
+                    seen.set("observation", true.clone())
+
+        def after(module: nn.Module, _: tuple[Any, ...], output: Any) -> None:
+            if isinstance(module, QueryEvaluator):
+                if self.answer:
+                    write(output, module, [truth, 10.0 * truth.float() - 5.0])
+                answers.append(output.get(module.out_keys[0]).float())
+            if running and module is running[0][0]:
+                shown = running.pop()[1]
+                if isinstance(output, TensorDictBase):
+                    calls.append((shown, output.get("action").clone()))
+
+        with register_module_forward_pre_hook(before), register_module_forward_hook(after):
+            yield calls, answers
+
+    def _is_innermost(self, module: nn.Module) -> bool:
+        """Return whether a module is an innermost policy, which maps an observation to an action.
+
+        Modules of this package count as innermost, others only if they contain no other such module.
+        """
         if module not in self._innermost:
             inner = [] if type(module).__module__.startswith("lw_torchrl.") else [*module.modules()][1:]
             self._innermost[module] = _acts(module) and not any(map(_acts, inner))
-        shown = tensordict.get("observation", None) if self._innermost[module] else None
-        return shown is not None and shown.shape == self._true.shape
-
-    def _correct(self, module: nn.Module, args: tuple[Any, ...]) -> None:
-        if not self._inside and args and self._watched(module, args[0]):
-            assert self._true is not None
-            self._inside, self._shown = [module], args[0].get("observation").clone()
-            if self.correct:
-                args[0].set("observation", self._true.clone())
-
-    def _look(self, module: nn.Module, args: tuple[Any, ...], output: Any) -> None:
-        if self._inside and module is self._inside[0]:
-            self._inside = []
-            if isinstance(output, TensorDictBase):
-                self._calls.append((self._shown, output.get("action").clone()))
+        return self._innermost[module]
 
 
 def gripper_of(plans: Plans) -> Tensor:
-    """Return (A,) bool: which entry of an action is the gripper's."""
+    """Return a mask (A,) bool that selects the gripper's entry of an action."""
     numbers = torch.arange(plans.layout.action_size)
     return numbers == (-1 if plans.layout.gripper is None else plans.layout.gripper)
 

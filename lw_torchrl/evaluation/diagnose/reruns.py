@@ -4,314 +4,250 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from operator import itemgetter
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
-from torch import Tensor
 from torchrl.envs import RenameTransform, Transform
 
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.envs.seeding import action_noise
-from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, Difference, MendedEpisode, Misled
+from lw_torchrl.envs.rows import action_noise
+from lw_torchrl.evaluation.diagnose.failure import Finding, MendedEpisode, replacement_text
 from lw_torchrl.evaluation.diagnose.replacements import (
-    COMMANDED,
-    DECIDED,
-    SCRIPTED,
-    SHOWN,
+    MEASURED,
     TRUE_OBSERVATION,
     Control,
     EpisodeId,
     Scripts,
+    attended,
     gripper_of,
-    with_true_answers,
+    weights_of,
 )
-from lw_torchrl.evaluation.diagnose.sentences import replacement_text
-from lw_torchrl.evaluation.diagnose.states import OTHER, EpisodeStates, Motion, states_of
+from lw_torchrl.evaluation.diagnose.states import OFTEN_WRONG, OTHER, FailedEpisode, Motion, exact_answers
 from lw_torchrl.evaluation.rollout import rollout
 from lw_torchrl.language.canonical import canonical_like
-from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.policy import plans_of, with_plans
+from lw_torchrl.modules.query_evaluator import evaluators_of
 
-_KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
-_MEASURED = [TRUE_OBSERVATION, SHOWN, DECIDED, COMMANDED, SCRIPTED]
 _EXACT = 1e-4  # smaller differences between observations or between actions are rounding
-_SAME_STATE = 1e-6  # smaller differences between two simulations of a state are rounding
 _AFTER = 5  # number of states in which a difference between two simulations may grow
 
 
-@dataclass(frozen=True)
-class Rerun:
-    """A callable that re-runs episodes with the settings of the original run."""
+def difference(steps: TensorDictBase, again: TensorDictBase) -> Finding | None:
+    """Return the first difference between two runs of an episode, or None if they are identical."""
+    both = min(len(steps), len(again))
+    errors = (steps.get("observation")[:both] - again.get("observation")[:both]).abs().amax(-1)
+    if not (errors > 0).any():
+        values = {"at": both - 1, "given": len(steps), "again": len(again)}
+        return None if len(steps) == len(again) else Finding("other length", values)
+    first = int((errors > 0).int().argmax())
+    executed = steps.get(("next", "executed_action"), steps.get("action", None))
+    if first and executed is None:
+        return Finding("unknown actions", {"at": first})
+    if first:
+        error = (executed[:first] - again.get("action")[:first]).abs().amax(-1)
+        if (error > 0).any():
+            at = int((error > 0).int().argmax())
+            return Finding("other actions", {"at": at, "size": float(error[at])})
+    size = float(errors[first : first + _AFTER].max())
+    return Finding("other states" if first else "other first state", {"at": first, "before": first - 1, "size": size})
 
+
+def _unfixed(cases: Iterable[FailedEpisode], *names: str) -> list[FailedEpisode]:
+    return [case for case in cases if not case.is_fixed(*names)]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings of re-runs, which replacements change."""
+
+    actor: Any
+    evaluator: Any
+    scripts: Scripts
+    noise_scale: float
+    engine: Any
+    max_steps: int
+    control: Mapping[str, Any] = field(default_factory=dict)  # arguments of Control
+
+
+@dataclass
+class Reruns:
+    """Re-runs of failed episodes with the settings of the original run, and with parts replaced."""
+
+    settings: Settings
+    reference: Plans | None
     tasks: Mapping[str, Task]
     env_options: Mapping[str, Any]
-    noise_scale: float
     num_envs: int | None
     device: str | torch.device | None
     progress: bool
 
-    def __call__(
-        self,
-        label: str,
-        which: Sequence[EpisodeId],
-        actor: Any,
-        scripts: Scripts,
-        evaluator: Any = None,
-        longer: int = 1,
-        noise: float | None = None,
-        engine: Any = ...,
-        **control: Any,
-    ) -> dict[EpisodeId, FinishedEpisode]:
-        """Re-run episodes, each up to its first success, with ``longer`` times the original time limit.
+    def __post_init__(self) -> None:
+        self.trusted = self._with_reference()  # the settings for the reference plans that differ from the policy's
+        self.gripper = gripper_of(self.settings.scripts.plans)
 
-        ``noise`` is the standard deviation of the noise, None for the original one; ``engine`` replaces the original
-        engine; ``control`` goes to :class:`Control`.
-        """
+    def run(self, rollouts: Mapping[EpisodeId, TensorDictBase]) -> list[FailedEpisode]:
+        """Re-run each episode with the replacements that can still decide the cause of its failure."""
+        plain = self._run("nothing replaced", list(rollouts), self.settings)
+        cases = [self._measure(steps, plain[which]) for which, steps in rollouts.items()]
+        left = self._try_measured([case for case in cases if not case.fails_elsewhere])
+        # Where wrong answers are a cause for certain, but not the only one, only pairs can show the other cause.
+        misled = [case for case in left if "query" in case.results and case.answers_wrong >= OFTEN_WRONG]
+        left = [case for case in left if case not in misled]
+        self._try("no noise", left if self.settings.noise_scale else [], noise_scale=0.0)
+        self._try_scripts(left)
+        left = _unfixed(left, "skill", "gripper", "actuation", "policy")
+        known = () if self.trusted is None else self.trusted.scripts.plans
+        self._try("plan", [case for case in left if case.task in known], self.trusted)
+        left = _unfixed(left, "plan", "no noise")
+        self._try("time", left, max_steps=2 * self.settings.max_steps)
+        # Try pairs only on the episodes that no single replacement fixes.
+        left = [*_unfixed(left, "time"), *misled]
+        pair, referred = [c for c in left if "query" in c.results], [c for c in left if c.task in known]
+        self._try("query + skill", pair, evaluator=None, control={"answer": True, "part": "all"})
+        both = [case for case in pair if case in referred]
+        self._try("query + plan", both, self.trusted, evaluator=None, control={"answer": True})
+        left = [case for case in _unfixed(referred, "query + skill", "query + plan") if case not in misled]
+        self._try("plan + skill", left, self.trusted, control={"part": "all"})
+        return cases
+
+    def _try_measured(self, cases: list[FailedEpisode]) -> list[FailedEpisode]:
+        """Correct wrong engines, observations, answers and actions, and return the episodes that still fail."""
+        evaluator = self.settings.evaluator
+        if callable(self.settings.engine):
+            self._try("environment", [c for c in cases if c.task in self.env_options["suite"].tasks], engine=None)
+            cases = _unfixed(cases, "environment")
+        is_transform = isinstance(evaluator, Transform)
+        without_sensor = None if is_transform and "observation" in evaluator.out_keys else evaluator
+        misled = [case for case in cases if case.misled]
+        self._try("perception", misled, evaluator=without_sensor, control={"correct": True})
+        if without_sensor is not None or evaluators_of(self.settings.actor):
+            wrong = [case for case in cases if not torch.equal(case.answers, case.truth)]
+            self._try("query", wrong, evaluator=None, control={"answer": True})
+        acts_on = is_transform and bool(evaluator.in_keys_inv)
+        changed = [case for case in cases if case.wrapped or (acts_on and case.executed)]
+        undone = self._try("wrapper", changed, evaluator=None if acts_on else evaluator, control={"unwrap": True})
+        for case in changed:
+            if case.wrapped is not None:
+                case.wrapped = case.wrapped.and_also(self._motions(undone[case.which], case.plan)["wrapped"])
+        return _unfixed(cases, "perception", "query", "wrapper")
+
+    def _try_scripts(self, cases: list[FailedEpisode]) -> None:
+        """Re-run episodes with scripts for all actions and, where this helps, for the parts that act differently."""
+        hand, every = ~self.gripper, self.gripper | True
+        # Without any difference, scripts would change nothing.
+        cases = [c for c in cases if not c.scripted.wanted.isfinite().all() or c.unlike(every) > 0.0]
+        again = self._try("policy", cases, control={"part": "all"})
+        cases = [case for case in cases if case.is_fixed("policy")]
+        for case in cases:
+            case.scripted = case.scripted.and_also(self._motions(again[case.which], case.plan)["scripted"])
+            in_all, worst, _ = case.scripted.of(hand).extent()
+            by_gripper = case.unlike(self.gripper) > max(OTHER, 2 * case.unlike(hand))
+            if plans_of(self.settings.actor) is not None and not in_all and worst >= 0 and not by_gripper:
+                case.step = worst
+        steps = {case.which: case.step for case in cases if case.step is not None}
+        self._try("skill", [c for c in cases if c.which in steps], control={"part": "all", "steps": steps})
+        left = _unfixed(cases, "skill") if self.gripper.any() else []
+        self._try("gripper", [case for case in left if case.unlike(self.gripper)], control={"part": "gripper"})
+        self._try("actuation", [case for case in left if case.unlike(hand)], control={"part": "motion"})
+
+    def _try(
+        self, name: str, cases: Sequence[FailedEpisode], settings: Settings | None = None, **changes: Any
+    ) -> dict[EpisodeId, FinishedEpisode]:
+        """Re-run episodes with a replacement and keep the successful re-runs; return all of them."""
+        if not cases:
+            return {}
+        settings = replace(settings or self.settings, **changes)
+        again = self._run(replacement_text(name), [case.which for case in cases], settings)
+        for case in cases:
+            episode, plan = again[case.which], settings.scripts.plans[case.task]
+            mended = MendedEpisode(name, plan, episode.steps.exclude(MEASURED))
+            case.results[name] = None if episode.first_success is None else mended
+        return again
+
+    def _measure(self, rollout: TensorDictBase, plain: FinishedEpisode) -> FailedEpisode:
+        """Compare the policy's observations with the true ones, and its actions with those that were executed."""
+        measured, plan = plain.steps.get(MEASURED), self.settings.scripts.plans[plain.task]
+        motions: dict[str, Any] = self._motions(plain, plan)
+        for name in ("wrapped", "executed"):
+            if (motions[name].done - motions[name].wanted).abs().max() <= _EXACT:
+                motions[name] = None
+        truth, answers = exact_answers(plan, plain.steps), measured.get("answered")[:, : len(plan.steps)] > 0.5
+        failed = FailedEpisode(plan, plain, truth, answers, motions["scripted"].active, **motions)
+        error = (measured.get("shown") - measured.get("true")).abs().amax(0)
+        if error.max() > _EXACT:
+            failed.misled = Finding("wrong observation", {"error": float(error.max()), "entry": int(error.argmax())})
+        failed.differs = difference(rollout, plain.steps)
+        return failed
+
+    def _motions(self, episode: FinishedEpisode, plan: ConditionalPlan) -> dict[str, Motion]:
+        """Compare the actions of innermost module and policy, of policy and environment, and of scripts and policy."""
+        steps, number, task = episode.steps, len(plan.steps), self.tasks[episode.task]
+        measured = steps.get(MEASURED)
+        weights = weights_of(steps, measured.get("answered")[:, :number] > 0.5, number)
+        active = attended(weights, torch.ones_like(weights, dtype=torch.bool))
+        seed, size = self.env_options["seed"], task.layout.action_size
+        noise = torch.from_numpy(action_noise(task, seed, episode.episode, len(steps), 1, size))
+        commanded = measured.get("commanded")
+        expected = (commanded + self.settings.noise_scale * noise).clamp(-1.0, 1.0)
+        return {
+            "wrapped": Motion(measured.get("decided"), commanded, active),
+            "executed": Motion(expected, steps.get("action"), active),
+            "scripted": Motion(measured.get("scripted"), commanded, active),
+        }
+
+    def _with_reference(self) -> Settings | None:
+        """Return settings with scripts, policy and evaluator for the reference plans that differ from the policy's."""
+        reference, settings = self.reference, self.settings
+        tasks = [] if reference is None else reference.differences(settings.scripts.plans)
+        if reference is None or not (different := [reference[task] for task in tasks if task in self.tasks]):
+            return None
+        plans, evaluator = Plans(different), settings.evaluator
+        try:
+            other = with_plans(settings.actor, canonical_like(plans, plans_of(settings.actor)))
+            plans = plans_of(other) or plans  # a policy may add plans that the reference lacks
+            evaluator = evaluator.with_plans(plans) if hasattr(evaluator, "with_plans") else evaluator
+        except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
+            message = "reference: the policy cannot follow the reference, so no plan is replaced"
+            warnings.warn(f"{message} ({type(error).__name__}: {error})", stacklevel=6)
+            return None
+        return replace(settings, actor=other, evaluator=evaluator, scripts=Scripts(plans, settings.scripts.table))
+
+    def _run(self, label: str, which: Sequence[EpisodeId], settings: Settings) -> dict[EpisodeId, FinishedEpisode]:
+        """Re-run each episode up to its first success or the time limit."""
         listed = {task: [k for _, k in group] for task, group in groupby(sorted(which), itemgetter(0))}
         episodes: dict[EpisodeId, FinishedEpisode] = {}
-
-        def keep(episode: FinishedEpisode) -> None:
-            episodes[episode.task, episode.episode] = episode
-
         rollout(
             f"re-running with {label}",
-            actor,
+            settings.actor,
             {task: self.tasks[task] for task in listed},
             listed,
-            keep,
-            plans=scripts.plans,
-            evaluator=evaluator,
+            lambda episode: episodes.update({(episode.task, episode.episode): episode}),
+            plans=settings.scripts.plans,
+            evaluator=settings.evaluator,
             num_envs=None if self.num_envs is None else max(len(listed), self.num_envs),
-            env_options={**self.env_options, "max_steps": self.env_options["max_steps"] * longer}
-            | ({} if engine is ... else {"engine": engine}),
-            keys=[*_KEYS, *_MEASURED],
+            env_options={**self.env_options, "engine": settings.engine, "max_steps": settings.max_steps},
+            keys=["observation", "task_id", "episode", "action", MEASURED, ("next", "success"), ("next", "reward")],
             optional=["qaf", "skill_weights"],
-            noise_scale=self.noise_scale if noise is None else noise,
+            noise_scale=settings.noise_scale,
             after_success=0,
             first=RenameTransform(["observation"], [TRUE_OBSERVATION], create_copy=True),
-            wrap=lambda actor: Control(actor, scripts, **control),
+            wrap=lambda actor: Control(actor, settings.scripts, **settings.control),
             device=self.device,
             progress=self.progress,
         )
         return episodes
 
-    def noise_of(self, which: EpisodeId, steps: int) -> Tensor:
-        """Return the noise (steps, A) that the environment adds to an episode's actions."""
-        task, number = which
-        size = self.tasks[task].layout.action_size
-        drawn = action_noise(self.tasks[task], self.env_options["seed"], number, steps, 1, size)
-        return self.noise_scale * torch.from_numpy(drawn)
 
-
-def difference(steps: TensorDictBase, again: TensorDictBase) -> Difference | None:
-    """Return the first difference between two runs of an episode, or None if they are identical."""
-    both = min(len(steps), len(again))
-    errors = (steps.get("observation")[:both] - again.get("observation")[:both]).abs().amax(-1)
-    if not (errors > 0).any():
-        return None if len(steps) == len(again) else Difference("length", both - 1, len(steps), len(again))
-    first = int((errors > 0).int().argmax())
-    executed = steps.get(("next", "executed_action"), steps.get("action", None))
-    if first and executed is None:
-        return Difference("states", first)
-    if first and executed is not None:
-        error = (executed[:first] - again.get("action")[:first]).abs().amax(-1)
-        if (error > 0).any():
-            at = int((error > 0).int().argmax())
-            return Difference("actions", at, size=float(error[at]))
-    return Difference("environment", first, size=float(errors[first : first + _AFTER].max()))
-
-
-@dataclass
-class Reruns:
-    """The re-runs of failed episodes, and what was measured in them."""
-
-    actor: Any
-    evaluator: Any
-    scripts: Scripts
-    reference: Plans | None
-    rerun: Rerun
-    seen: Mapping[EpisodeId, EpisodeStates]
-    plain: dict[EpisodeId, FinishedEpisode] = field(default_factory=dict)  # with nothing replaced
-    # For each replacement and each episode it was tried on: the re-run if it succeeded, otherwise None.
-    results: dict[str, dict[EpisodeId, FinishedEpisode | None]] = field(default_factory=dict)
-    differs: dict[EpisodeId, Difference] = field(default_factory=dict)
-    misled: dict[EpisodeId, Misled] = field(default_factory=dict)
-    wrapped: dict[EpisodeId, Motion] = field(default_factory=dict)  # decided and commanded actions
-    executed: dict[EpisodeId, Motion] = field(default_factory=dict)  # commanded and executed actions
-    scripted: dict[EpisodeId, Motion] = field(default_factory=dict)  # scripted and commanded actions
-    step: dict[EpisodeId, int] = field(default_factory=dict)  # the plan step in which a script was tried
-    # The scripts, the policy and the evaluator for the reference plans that differ from the policy's.
-    trusted: tuple[Scripts | None, Any, Any] = (None, None, None)
-
-    def run(self) -> None:
-        """Re-run the episodes with each replacement that can still decide the cause of the episode."""
-        every, self.trusted = list(self.seen), self._with_reference()
-        self.plain = self.rerun("nothing replaced", every, self.actor, self.scripts, self.evaluator)
-        for which, states in self.seen.items():
-            self._measure(which, states, self.plain[which].steps)
-        every = [which for which in every if not self.fails_elsewhere(which)]
-        own = set(self.rerun.env_options["suite"].tasks)
-        if callable(self.rerun.env_options["engine"]):
-            self._try("environment", [w for w in every if w[0] in own], engine=None)
-            every = self._unfixed(every, "environment")
-        is_sensor = isinstance(self.evaluator, Transform) and "observation" in self.evaluator.out_keys
-        evaluator, true = None if is_sensor else self.evaluator, with_true_answers(self.actor)
-        self._try("perception", [w for w in every if w in self.misled], evaluator=evaluator, correct=True)
-        can_answer = evaluator is not None or true is not self.actor
-        wrong = [w for w in every if can_answer and bool((self.seen[w].answers != self.seen[w].truth).any())]
-        self._try("query", wrong, true, evaluator=None)
-        acts_on = isinstance(self.evaluator, Transform) and bool(self.evaluator.in_keys_inv)
-        changed = [w for w in every if w in self.wrapped or (acts_on and w in self.executed)]
-        undone = self._try("wrapper", changed, evaluator=None if acts_on else self.evaluator, unwrap=True)
-        for which, episode in undone.items():
-            if which in self.wrapped:
-                self.wrapped[which] = self.wrapped[which].and_also(self._motion(which, episode.steps)[0])
-        left = self._unfixed(every, "perception", "query", "wrapper")
-        if self.rerun.noise_scale:
-            self._try("no noise", left, noise=0.0)
-        self._try_scripts(left)
-        left = self._unfixed(left, "skill", "gripper", "actuation", "policy")
-        trusted, other_actor, other_evaluator = self.trusted
-        with_reference = [w for w in left if trusted is not None and w[0] in trusted.plans]
-        self._try("plan", with_reference, other_actor, trusted, other_evaluator)
-        left = self._unfixed(left, "plan", "no noise")
-        self._try("time", left, longer=2)
-        # Try pairs only on the episodes that no single replacement fixes.
-        left = self._unfixed(left, "time")
-        pair, with_reference = [w for w in left if w in wrong], [w for w in left if w in with_reference]
-        self._try("query + skill", pair, true, evaluator=None, part="all")
-        both = [w for w in pair if w in with_reference]
-        self._try("query + plan", both, with_true_answers(other_actor), trusted, None)
-        left = self._unfixed(with_reference, "query + skill", "query + plan")
-        self._try("plan + skill", left, other_actor, trusted, other_evaluator, part="all")
-
-    def fails_elsewhere(self, which: EpisodeId) -> bool:
-        """Return whether the rollout's environment differs, or its plain re-run succeeds."""
-        return self.environment_differs(which) or self.plain[which].first_success is not None
-
-    def environment_differs(self, which: EpisodeId) -> bool:
-        first = self.differs.get(which)
-        return first is not None and first.part == "environment" and (first.size or 0.0) > _SAME_STATE
-
-    def fixes(self, name: str, which: EpisodeId) -> bool:
-        return self.results.get(name, {}).get(which) is not None
-
-    def _unfixed(self, episodes: Iterable[EpisodeId], *names: str) -> list[EpisodeId]:
-        return [which for which in episodes if not any(self.fixes(name, which) for name in names)]
-
-    def _try(
-        self,
-        name: str,
-        which: Sequence[EpisodeId],
-        actor: Any = None,
-        scripts: Scripts | None = None,
-        evaluator: Any = ...,
-        **options: Any,
-    ) -> dict[EpisodeId, FinishedEpisode]:
-        """Re-run episodes with a replacement and keep the successful re-runs; return all of them."""
-        if not which:
-            return {}
-        evaluator = self.evaluator if evaluator is ... else evaluator
-        parts = actor or self.actor, scripts or self.scripts, evaluator
-        again = self.rerun(replacement_text(name), which, *parts, **options)
-        kept = {w: None if episode.first_success is None else episode for w, episode in again.items()}
-        self.results.setdefault(name, {}).update(kept)
-        return again
-
-    def _measure(self, which: EpisodeId, states: EpisodeStates, again: TensorDictBase) -> None:
-        """Compare what the policy was shown with the true state, and what was done with what was decided."""
-        if (first := difference(states.steps, again)) is not None:
-            self.differs[which] = first
-        error = (again.get(SHOWN) - again.get(TRUE_OBSERVATION)).abs().amax(0)
-        if error.max() > _EXACT:
-            self.misled[which] = Misled(float(error.max()), int(error.argmax()))
-        wrapped, executed, self.scripted[which] = self._motion(which, again)
-        if (wrapped.done - wrapped.wanted).abs().max() > _EXACT:
-            self.wrapped[which] = wrapped
-        if (executed.done - executed.wanted).abs().max() > _EXACT:
-            self.executed[which] = executed
-
-    def _motion(self, which: EpisodeId, again: TensorDictBase) -> tuple[Motion, Motion, Motion]:
-        """Compare decided with commanded, commanded with executed, and scripted with commanded actions."""
-        active = states_of(*which, again, self.scripts.plans, None).active
-        commanded = again.get(COMMANDED)
-        expected = (commanded + self.rerun.noise_of(which, len(again))).clamp(-1.0, 1.0)
-        return (
-            Motion(again.get(DECIDED), commanded, active),
-            Motion(expected, again.get("action"), active),
-            Motion(again.get(SCRIPTED), commanded, active),
-        )
-
-    def _try_scripts(self, left: list[EpisodeId]) -> None:
-        """Re-run with scripts in control of everything, and where that helps, of the parts that act differently."""
-        gripper = gripper_of(self.scripts.plans)
-        same = [w for w in left if self.scripted[w].wanted.isfinite().all() and self.unlike(w, gripper | True) == 0.0]
-        left = [which for which in left if which not in same]  # scripts would change nothing
-        for which, episode in self._try("policy", left, part="all").items():
-            if self.fixes("policy", which):
-                self.scripted[which] = self.scripted[which].and_also(self._motion(which, episode.steps)[2])
-        left = [which for which in left if self.fixes("policy", which)]
-        if plans_of(self.actor) is not None:
-            for which in left:
-                in_all, worst, _ = self.scripted[which].of(~gripper).extent()
-                if not in_all and worst >= 0 and not self.by_gripper(which):
-                    self.step[which] = worst
-            steps = {which: self.step[which] for which in left if which in self.step}
-            self._try("skill", list(steps), part="all", steps=steps)
-        left = self._unfixed(left, "skill")
-        if bool(gripper.any()):
-            self._try("gripper", [w for w in left if self.unlike(w, gripper) > 0.0], part="gripper")
-            self._try("actuation", [w for w in left if self.unlike(w, ~gripper) > 0.0], part="motion")
-
-    def by_gripper(self, which: EpisodeId) -> bool:
-        """Return whether the gripper differs much from the scripts' gripper, and much more than the motion does."""
-        gripper = gripper_of(self.scripts.plans)
-        return self.unlike(which, gripper) > max(OTHER, 2 * self.unlike(which, ~gripper))
-
-    def unlike(self, which: EpisodeId, entries: Tensor) -> float:
-        """Return how far the policy's actions are from the scripts', in the plan step where they differ most."""
-        return self.scripted[which].of(entries).error()
-
-    def _with_reference(self) -> tuple[Scripts | None, Any, Any]:
-        """Return the scripts, the policy and the evaluator with the reference plans that differ from the policy's."""
-        reference = self.reference
-        different = [] if reference is None else [reference[task] for task in reference.differences(self.scripts.plans)]
-        if not different:
-            return None, None, None
-        plans, evaluator = Plans(different), self.evaluator
-        try:
-            other = with_plans(self.actor, canonical_like(plans, plans_of(self.actor)))
-            plans = plans_of(other) or plans  # a policy may add plans that the reference lacks
-            evaluator = evaluator.with_plans(plans) if hasattr(evaluator, "with_plans") else evaluator
-        except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
-            reason = f"{type(error).__name__}: {error}"
-            message = f"reference: the policy cannot follow the reference, so no plan is replaced ({reason})"
-            warnings.warn(message, stacklevel=5)
-            return None, None, None
-        return Scripts(plans, self.scripts.table), other, evaluator
-
-    def mended(self, by: str | None, which: EpisodeId) -> MendedEpisode | None:
-        """Return the successful re-run of an episode with replacement ``by``; None if there is none."""
-        episode = None if by is None else self.results[by].get(which)
-        if episode is None or by is None:
-            return None
-        scripts = self.trusted[0] if "plan" in REPLACEMENTS[by] else None
-        plans = (scripts or self.scripts).plans
-        return MendedEpisode(by, plans[which[0]], episode.steps.exclude(*_MEASURED))
-
-    def shares(self) -> dict[str, dict[str, float]]:
-        """Return, by task and replacement, the fraction of the failed episodes it was tried on that it fixes."""
-        shares: dict[str, dict[str, float]] = {}
-        for task in {task for task, _ in self.seen}:
-            plain = [self.plain[which].first_success is not None for which in self.seen if which[0] == task]
-            shares[task] = {"nothing": sum(plain) / len(plain)}
-            for name, results in self.results.items():
-                if fixed := [episode is not None for (of, _), episode in results.items() if of == task]:
-                    shares[task][name] = sum(fixed) / len(fixed)
-        return shares
+def shares_of(cases: Sequence[FailedEpisode]) -> dict[str, float]:
+    """Return, for each replacement, the fraction of failed episodes that succeed with it, where it was tried."""
+    tried = {"nothing": [case.plain.first_success is not None for case in cases]}
+    for case in cases:
+        for name, episode in case.results.items():
+            tried.setdefault(name, []).append(episode is not None)
+    return {name: sum(fixed) / len(fixed) for name, fixed in tried.items()}

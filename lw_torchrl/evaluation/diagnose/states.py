@@ -1,18 +1,17 @@
-"""Analyze the states of a failed episode: wrong answers, deviations from a reference plan, and the final plan step."""
+"""A failed episode and its re-runs; find wrong answers, departures from a reference plan, and the final plan step."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.nn.functional import one_hot
 
-from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Cause, Finding, NoCondition, PlanDeparts, WrongAnswers
-from lw_torchrl.evaluation.diagnose.replacements import Scripts, attended
-from lw_torchrl.language.layout import METAWORLD, Layout
+from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.evaluation.diagnose.failure import Finding, MendedEpisode
+from lw_torchrl.evaluation.diagnose.replacements import EpisodeId, Scripts, chosen
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.transforms.qaf import truth_of_episode
 
@@ -23,15 +22,17 @@ _DELAYS = 26  # delays up to this number of time steps are tried
 _LATE = 100  # number of last states of a failed episode, in which the episode made no progress
 _AHEAD, _STILL = 10, 0.01  # the hand stands still if it moves less than 1 cm in 10 states
 _AWAY = 25  # longest interruption (in states) of a visit to a plan step, so that two alternating steps are one visit
-_WRONG = 0.01  # the smallest fraction of states with wrong answers that counts
+_OTHER_STATES = ("other states", "other first state")
+_SAME_STATE = 1e-6  # smaller differences between two simulations of a state are rounding
+WRONG, OFTEN_WRONG = 0.01, 0.5  # fractions of states with wrong answers that may be, and certainly are, a cause
 OTHER = 0.3  # actions that differ by more than this on any axis serve different purposes
 
 
 class Motion(NamedTuple):
-    """What was done in T states, what should have been done, and the active plan step."""
+    """The right actions and the actual actions in T states, and the active plan steps."""
 
-    wanted: Tensor  # (T, A) float32, NaN where unknown
-    done: Tensor  # (T, A) float32
+    wanted: Tensor  # (T, A) float32, the right actions; NaN where unknown
+    done: Tensor  # (T, A) float32, the actual actions
     active: Tensor  # (T,) int64, -1 for none
 
     def and_also(self, other: Motion) -> Motion:
@@ -39,7 +40,7 @@ class Motion(NamedTuple):
         return Motion(*(torch.cat(both) for both in zip(self, other, strict=True)))
 
     def of(self, entries: Tensor) -> Motion:
-        """Return the motion of the action's entries selected by ``entries`` (A,) bool, where it is known."""
+        """Restrict the motion to the action entries that ``entries`` (A,) bool selects, and to known right actions."""
         known = (self.active >= 0) & self.wanted.isfinite().all(-1)
         return Motion(self.wanted[known][:, entries], self.done[known][:, entries], self.active[known])
 
@@ -59,7 +60,7 @@ class Motion(NamedTuple):
         """Return the simplest fault that explains the error in the states ``where`` (T,) bool, and its actions (T, A).
 
         Each fault is fitted to these states by least squares: a constant, a factor for each axis, a shift, a delay of
-        whole steps, or a linear map of all axes. "irregular" explains too little.
+        whole steps, or a linear map of all axes. The name is "irregular" if no fault explains half of the error.
         """
         wanted, done = self.wanted, self.done
         square = wanted[where].square().sum(0).clamp(min=1e-6)
@@ -80,10 +81,10 @@ class Motion(NamedTuple):
     def extent(self, exact: bool = False) -> tuple[bool | None, int, str]:
         """Return whether the fault is in all plan steps, the plan step with the largest error, and the fault's shape.
 
-        The fault of the plan step with the largest error predicts what would be done in the other plan steps. It is in
-        all plan steps if it explains their errors, or if they have other errors about as large. It is in one plan step
-        if the others lack an error that the fault predicts. None if neither can be decided. If ``exact``, there are no
-        other errors, so that any error in other plan steps shows the fault.
+        The fault is estimated in the plan step with the largest error, and predicts the errors of the other plan steps.
+        The first value is True if the fault explains these errors or if they are about as large, False if they are
+        smaller than predicted, and None if neither is clear. With ``exact``, the fault is the only possible error, so
+        any error in another plan step gives True.
         """
         errors = self.errors()
         if not errors:
@@ -117,26 +118,58 @@ def _rms(values: Tensor, where: Tensor) -> float:
     return float(values[where].square().sum(-1).mean().sqrt())
 
 
-class EpisodeStates(NamedTuple):
-    """The T states of a failed episode under a plan with S steps."""
+@dataclass(eq=False)
+class FailedEpisode:
+    """A failed episode with a plan of S steps, its plain re-run of T states, and the results of further re-runs."""
 
-    task: str
-    episode: int
-    steps: TensorDictBase  # the recorded time steps, of batch (T,)
+    plan: ConditionalPlan
+    plain: FinishedEpisode  # the re-run with nothing replaced
     truth: Tensor  # (T, S) bool, the exact answers
     answers: Tensor  # (T, S) bool, the answers that the policy acted on
-    weights: Tensor  # (T, S) float32, the policy's attention over the plan steps
     active: Tensor  # (T,) int64, the plan step with the largest weight; -1 where all weights are equal
+    scripted: Motion  # scripted and commanded actions
+    wrapped: Motion | None = None  # decided and commanded actions, if they differ
+    executed: Motion | None = None  # commanded and executed actions, if they differ
+    misled: Finding | None = None
+    differs: Finding | None = None  # the first difference between the rollout and the plain re-run
+    step: int | None = None  # the plan step in which a script was tried
+    # The re-run with each replacement that was tried if the episode then succeeded, otherwise None.
+    results: dict[str, MendedEpisode | None] = field(default_factory=dict)
 
     @property
-    def which(self) -> tuple[str, int]:
-        return self.task, self.episode
+    def task(self) -> str:
+        return self.plain.task
 
-    def active_time(self, plan: ConditionalPlan, step: int, distance: float | None = None) -> ActiveStep:
-        """Return a finding that counts in how many of the last 100 states a plan step was active."""
-        late = min(_LATE, len(self.active))
-        states = int((self.active == step)[-late:].sum())
-        return ActiveStep(step, plan.steps[step].skill, states, late, distance)
+    @property
+    def which(self) -> EpisodeId:
+        return self.plain.task, self.plain.episode
+
+    @property
+    def late(self) -> int:
+        """The number of last states, at most 100, in which the episode made no progress."""
+        return min(_LATE, len(self.active))
+
+    @property
+    def answers_wrong(self) -> float:
+        """The fraction of states in which a condition was answered wrongly."""
+        return float((self.answers != self.truth).any(-1).float().mean())
+
+    @property
+    def environment_differs(self) -> bool:
+        first = self.differs
+        return first is not None and first.kind in _OTHER_STATES and float(first.values["size"]) > _SAME_STATE
+
+    @property
+    def fails_elsewhere(self) -> bool:
+        """Whether the rollout's environment differs from the suite's, or the plain re-run succeeds."""
+        return self.environment_differs or self.plain.first_success is not None
+
+    def is_fixed(self, *names: str) -> bool:
+        return any(self.results.get(name) is not None for name in names)
+
+    def unlike(self, entries: Tensor) -> float:
+        """Return the largest difference, over plan steps, between the policy's actions and the scripted actions."""
+        return self.scripted.of(entries).error()
 
 
 class Blame(NamedTuple):
@@ -147,38 +180,18 @@ class Blame(NamedTuple):
     finding: Finding
 
 
-class Explanation(NamedTuple):
-    """The cause that follows from the states alone, without re-runs."""
+class Departures(NamedTuple):
+    """A comparison of a plan with a reference plan in T states."""
 
-    cause: Cause  # "undecided" if the states do not show the cause
-    blames: Mapping[str, Blame]  # for each possible cause, where it shows
-    evidence: Mapping[str, float]  # measured numbers by name
-
-
-def chosen(truth: Tensor, steps: int) -> Tensor:
-    """Return (T,) int64: the first of ``steps`` plan steps whose condition holds in ``truth`` (T, S), or the last."""
-    here = truth[..., :steps]
-    return torch.where(here.any(-1), here.int().argmax(-1), steps - 1)
+    reference: ConditionalPlan
+    departs: Tensor  # (T,) bool, whether the two plans request different actions
+    ours: Tensor  # (T,) int64, the step that the plan chooses
+    theirs: Tensor  # (T,) int64, the step that the reference chooses
 
 
 def exact_answers(plan: ConditionalPlan, steps: TensorDictBase) -> Tensor:
     """Return the exact answers (T, S) bool to a plan's conditions in an episode's states."""
     return truth_of_episode(Plans([plan]), steps)[:, : len(plan.steps)]
-
-
-def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, answers: Tensor | None) -> EpisodeStates:
-    """Return an episode's states under the policy's plan; ``answers`` are used if no ``qaf_logits`` were recorded."""
-    number = len(plans[task].steps)
-    truth = exact_answers(plans[task], steps)
-    if (logits := steps.get("qaf_logits", None)) is not None:
-        answers = logits > 0
-    elif answers is None and (recorded := steps.get("qaf", None)) is not None:
-        answers = recorded > 0.5
-    answers = truth if answers is None else answers[:, :number]
-    weights = steps.get("skill_weights", None)
-    weights = one_hot(chosen(answers, number), number).float() if weights is None else weights[:, :number]
-    active = attended(weights, torch.ones_like(weights, dtype=torch.bool))
-    return EpisodeStates(task, episode, steps, truth, answers, weights, active)
 
 
 def last_stay_start(states: Tensor) -> int:
@@ -190,98 +203,69 @@ def last_stay_start(states: Tensor) -> int:
     return int(places[gaps[-1] + 1] if len(gaps) else places[0])
 
 
-def stall_step(seen: EpisodeStates, step: int, layout: Layout = METAWORLD) -> int:
+def stall_step(failed: FailedEpisode, step: int) -> int:
     """Return the state in which the hand stopped during the last visit to a plan step.
 
     If the hand did not stop, return the first state of the visit.
     """
-    inside = seen.active == step
+    inside = failed.active == step
     begin = last_stay_start(inside)
-    hand = seen.steps.get("observation")[begin:, layout.positions[0]]
+    hand = failed.plain.steps.get("observation")[begin:, failed.plan.definition.layout.positions[0]]
     still = ((hand[_AHEAD:] - hand[:-_AHEAD]).norm(dim=-1) < _STILL) & inside[begin : begin + len(hand[_AHEAD:])]
     return begin + (int(still.int().argmax()) if still.any() else 0)
 
 
-def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) -> Explanation:
-    """Apply the rule of :func:`attribute_failures` to an episode's states.
-
-    Without a reference, the plan is to blame if no condition holds, and a skill if it stays active far from its target.
-    """
-    plan, length = scripts.plans[seen.task], len(seen.active)
-    late = min(_LATE, length)
-    late_steps = seen.active[-late:][seen.active[-late:] >= 0]
-    stuck = int(torch.bincount(late_steps).argmax()) if len(late_steps) else len(plan.steps) - 1
-    stalled = stall_step(seen, stuck, scripts.plans.layout)
-    blames, evidence = {}, {"states": float(length)}
-
-    # Query: wrong answers, of which those that changed the chosen plan step matter most.
-    wrong = seen.answers != seen.truth
-    share = evidence["answers_wrong"] = float(wrong.any(-1).float().mean())
-    if share:
-        changes = chosen(seen.answers, len(plan.steps)) != chosen(seen.truth, len(plan.steps))
-        matter = wrong & changes.unsqueeze(-1) if changes.any() else wrong
-        column = int(matter.sum(0).argmax())
-        evidence["answers_wrong_late"] = float(wrong[-late:].any(-1).float().mean())
-        here = wrong[:, column].int()
-        condition = str(plan.steps[column].condition)
-        wrong_answers = WrongAnswers(column, condition, int(here.sum()), length, int(here.argmax()))
-        blames["query"] = Blame(column, int(matter[:, column].int().argmax()), wrong_answers)
-
-    # Plan: states in which no condition holds, or in which the reference requests a different action.
-    none = ~seen.truth.any(-1)
-    evidence["no_condition_late"] = float(none[-late:].float().mean())
-    if reference is None or seen.task not in reference.plans:
-        uncovered = NoCondition(int(none[-late:].sum()), late)
-        blames["plan"] = Blame(stuck, last_stay_start(none) if none.any() else stalled, uncovered)
-    else:
-        other = reference.plans[seen.task]
-        departs, ours, theirs = _departs(seen, plan, scripts, other, reference)
-        evidence["plan_departs"] = float(departs.float().mean())
-        evidence["plan_departs_late"] = float(departs[-late:].float().mean())
-        recent, where, step, requested = int(departs[-late:].sum()), departs.clone(), stuck, other.steps[0].skill
-        where[:-late] &= not recent
-        if where.any():
-            step = int(torch.bincount(ours[where]).argmax())
-            requested = other.steps[int(torch.bincount(theirs[where & (ours == step)]).argmax())].skill
-        uncovers = bool(where.any()) and bool(none[where].float().mean() > 0.5)
-        states, of = (recent, late) if recent else (int(departs.sum()), length)
-        at = last_stay_start(departs & (ours == step)) if departs.any() else stalled
-        finding = PlanDeparts(step, plan.steps[step].skill, requested, states, of, bool(recent), uncovers)
-        blames["plan"] = Blame(step, at, finding)
-
-    # Skill: the plan step in which the episode got stuck.
-    evidence["in_step_late"] = float((seen.active == stuck)[-late:].float().mean())
-    if scripts.known[seen.task][stuck]:
-        last = seen.steps[-1:]
-        distance = float(scripts.distance(last.get("observation"), last.get("task_id"), stuck))
-        evidence["distance_at_end"] = distance
-    time = seen.active_time(plan, stuck, evidence.get("distance_at_end"))
-    blames["skill"] = blames["undecided"] = Blame(stuck, stalled, time)
-    blames["out of time"] = Blame(stuck, length - 1, time)
-
-    cause: Cause = "undecided"
-    if share >= _WRONG:
-        cause = "query"
-    elif "plan_departs_late" in evidence:
-        cause = "plan" if evidence["plan_departs_late"] > 0.5 else "skill"
-    elif evidence["no_condition_late"] > 0.5:
-        cause = "plan"
-    elif evidence["in_step_late"] > 0.9 and evidence.get("distance_at_end", 0.0) > 0.05:
-        cause = "skill"
-    return Explanation(cause, blames, evidence)
+def last_active_step(failed: FailedEpisode) -> int:
+    """Return the plan step that was active in most of the last 100 states."""
+    late = failed.active[-failed.late :]
+    return int(torch.bincount(late[late >= 0]).argmax()) if (late >= 0).any() else len(failed.plan.steps) - 1
 
 
-def _departs(
-    seen: EpisodeStates, plan: ConditionalPlan, scripts: Scripts, other: ConditionalPlan, other_scripts: Scripts
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return whether plan and reference request different actions (T,) bool, and the chosen plan step of each (T,)."""
-    observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
-    ours, theirs = chosen(seen.truth, len(plan.steps)), chosen(exact_answers(other, seen.steps), len(other.steps))
-    rows = torch.arange(len(ours))
-    done = scripts.program(observation, task_id)[rows, ours]
-    wanted = other_scripts.program(observation, task_id)[rows, theirs]
-    differ = (done - wanted).abs().amax(-1) > OTHER
-    # Two skills of which one has no script differ if their texts differ.
+def blame_step(failed: FailedEpisode, scripts: Scripts, step: int) -> Blame:
+    """Blame a plan step in which the episode got stuck."""
+    states = int((failed.active == step)[-failed.late :].sum())
+    values: dict[str, Any] = {"step": step, "skill": failed.plan.steps[step].skill, "states": states, "of": failed.late}
+    distance = scripts.distance(failed.task, step, failed.plain.steps.get("observation")[-1])
+    if distance is not None:
+        values["distance_cm"] = 100 * distance
+    return Blame(step, stall_step(failed, step), Finding("active step" if distance is None else "distant step", values))
+
+
+def blame_answers(failed: FailedEpisode) -> Blame:
+    """Blame the plan step with most wrong answers; if some of them changed the chosen plan step, count only these."""
+    wrong, number = failed.answers != failed.truth, len(failed.plan.steps)
+    changes = chosen(failed.answers, number) != chosen(failed.truth, number)
+    matter = wrong & changes.unsqueeze(-1) if changes.any() else wrong
+    step = int(matter.sum(0).argmax())
+    here = wrong[:, step].int()
+    values: dict[str, Any] = {"step": step, "condition": str(failed.plan.steps[step].condition)}
+    values |= {"states": int(here.sum()), "of": len(here), "first": int(here.argmax())}
+    finding = Finding("wrong answers", values)
+    return Blame(step, int(matter[:, step].int().argmax()), finding)
+
+
+def blame_plan(failed: FailedEpisode, compared: Departures) -> Blame:
+    """Blame the plan step in which the reference requests a different action most often, in the last states if any."""
+    reference, departs, ours, theirs = compared
+    of = failed.late if departs[-failed.late :].any() else len(departs)
+    where = departs.clone()
+    where[:-of] = False
+    step = int(torch.bincount(ours[where]).argmax())
+    requested = reference.steps[int(torch.bincount(theirs[where & (ours == step)]).argmax())].skill
+    kind = "no condition" if float((~failed.truth.any(-1))[where].float().mean()) > _HALF else "plan departs"
+    values: dict[str, Any] = {"step": step, "skill": failed.plan.steps[step].skill, "reference": requested}
+    finding = Finding(kind, values | {"states": int(where.sum()), "of": of})
+    return Blame(step, last_stay_start(departs & (ours == step)), finding)
+
+
+def departures(failed: FailedEpisode, scripts: Scripts, trusted: Scripts) -> Departures:
+    """Compare the actions that an episode's plan and the reference plan in ``trusted`` request in its states."""
+    steps, plan, other = failed.plain.steps, failed.plan, trusted.plans[failed.task]
+    ours, theirs = chosen(failed.truth, len(plan.steps)), chosen(exact_answers(other, steps), len(other.steps))
+    inputs, rows = (steps.get("observation"), steps.get("task_id")), torch.arange(len(ours))
+    done, wanted = scripts.program(*inputs)[rows, ours], trusted.program(*inputs)[rows, theirs]
+    # If one of two skills has no script, compare their texts.
     same_text = torch.tensor([[a.skill == b.skill for b in other.steps] for a in plan.steps])[ours, theirs]
-    scripted = torch.tensor(scripts.known[plan.task])[ours] & torch.tensor(other_scripts.known[other.task])[theirs]
-    return torch.where(scripted, differ, ~same_text), ours, theirs
+    scripted = scripts.has_script(failed.task)[ours] & trusted.has_script(failed.task)[theirs]
+    departs = torch.where(scripted, (done - wanted).abs().amax(-1) > OTHER, ~same_text)
+    return Departures(other, departs, ours, theirs)

@@ -29,8 +29,8 @@ class Style:
 class PlanFormat:
     """A text format for plans: a writer, a reader and a prompt.
 
-    ``prompt`` maps ``(examples, task, hints)`` to a prompt for a language model: example plans for other tasks, lines
-    of hints, then the task's name and description.
+    ``prompt`` maps ``(examples, task, hints)`` to a prompt for a language model. The prompt shows example plans for
+    other tasks, lines of hints, and then the task's name and description.
     """
 
     extension: str  # file extension, "py" or "md"
@@ -52,7 +52,7 @@ class Styled:
 
 
 PROGRAM_WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "programs.toml", ValueError)
-"""The words by which the readers recognise programs."""
+"""The words by which the readers recognize programs."""
 
 STYLES = {"basic": Style(), "chain": Style(explains=True), "goal": Style(explains=True, goals=True)}
 """The paper's three styles, by name."""
@@ -87,8 +87,8 @@ class Clause:
 class Section:
     """A section of a text, with the clauses for one task."""
 
-    task: str  # the task's name; "" for text before any name, which continues the prompt
-    line: int  # the section's first line
+    task: str  # the task's name; "" for the text before the first name, which may continue the prompt
+    line: int  # number of the section's first line, from 1
     clauses: list[Clause] = field(default_factory=list)  # in the order of the text
     listed: str = ""  # the list of steps before the clauses, "1. first  2. second"
     tree: Node | None = None  # a program with control flow, which is compiled into clauses
@@ -159,11 +159,12 @@ def task_name(name: str) -> str:
 
 
 def is_for_any_task(name: str) -> bool:
-    """Return whether a function's name names no task: "policy", "step"."""
+    """Return whether a function's name is a generic one, such as "policy" or "step", instead of a task's name."""
     return " ".join(words_of(name)) in PROGRAM_WORDS["any_task"]
 
 
 _CALL = re.compile(r"\b([A-Za-z]\w*)\(([^()]*)\)")
+_DISTANCE = re.compile(r"\(?([\w' ]+?) (?:dist|distance)(?: to)? ([\w' ]+?)\)? *([<>])=? *[\d.]+(?: ?(?:cm|m)\b)?")
 _QUESTION = re.compile(r"(?:(?:is|are|does|has|do)\s+)?(.+?)\s*\?", re.IGNORECASE)
 
 
@@ -179,6 +180,8 @@ def statement(text: str) -> str:
         return words if call[0] == text else f"({words})"
 
     text = " ".join(_CALL.sub(said, text).replace("&&", "&").replace("||", "|").split())
+    text = _DISTANCE.sub(lambda match: f"{'not ' * (match[3] == '>')}({match[1]} near {match[2]})", text)
+    text = re.sub(r"[!¬~]\s*(?:not\b\s*)?(?=[\w(])", "not ", re.sub(r"\s*!=\s*(?!true|false)", " is not ", text))
     question = _QUESTION.fullmatch(text)
     return (question[1] if question else text).replace(" & ", " and ").replace(" | ", " or ")
 
@@ -207,7 +210,7 @@ _AND = re.compile(r",?\s(?:and|then)(?:\sthen)?\s(?=(\w+))")
 
 
 def in_turn(text: str, line: int) -> Node:
-    """Return the actions that a text joins: "open the gripper and move above the puck" gives two, in turn."""
+    """Split a text such as "open the gripper and move above the puck" into a sequence of actions."""
     parts, start = list[Node](), 0
     for match in _AND.finditer(text):
         if match[1].lower() in PROGRAM_WORDS["motions"]:

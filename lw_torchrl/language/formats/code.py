@@ -1,13 +1,13 @@
-"""A reader of programs in Python: any function with control flow. The text is parsed, never executed."""
+"""A reader of plans that are Python functions with control flow. The text is parsed, never executed."""
 
 from __future__ import annotations
 
 import ast
 import re
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from lw_torchrl._util.checks import shown
 from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, as_expression, negate
@@ -20,6 +20,7 @@ from lw_torchrl.language.formats.base import (
     task_name,
     words_of,
 )
+from lw_torchrl.language.formats.phrases import is_noun
 from lw_torchrl.language.formats.python import state_to_reach
 from lw_torchrl.language.programs import (
     Action,
@@ -37,7 +38,7 @@ from lw_torchrl.language.programs import (
 PYTHON = PROGRAM_WORDS["python"]
 _RELATIONS = [*PROGRAM_WORDS["prepositions"], "of", "aligned"]  # the last words of relations
 _COMMENTS = PROGRAM_WORDS["keys"]["comment"]
-_MOST_REPAIRS = 8  # maximum number of syntax errors to cut off
+_MOST_REPAIRS = 8  # maximum number of syntax errors to repair by cutting off code
 _MOST_TEXTS = 64  # maximum number of values of a text that depends on conditions
 _LONGEST = 1_000  # maximum length of a text (characters)
 _MOST_INLINED = 500  # maximum number of inlined calls and unrolled rounds, which bounds the time
@@ -56,27 +57,41 @@ class _Choice:
     def __post_init__(self) -> None:
         count = sum(each.count if isinstance(each, _Choice) else 1 for each in (self.then, self.otherwise))
         if count > _MOST_TEXTS:
-            raise ProgramError(f"a text must depend on few conditions; it has more than {_MOST_TEXTS} values")
+            raise ProgramError(f"a string that depends on conditions must have at most {_MOST_TEXTS} possible values")
         object.__setattr__(self, "count", count)
 
 
+class _Name(str):
+    """The words of a name that the program does not define, such as "puck" for ``env.puck``."""
+
+
+@dataclass(frozen=True)
+class _Distance:
+    """The distance between two objects (in the plane for ``hand[:2] - puck[:2]``), and the relation if it is small."""
+
+    first: _Text
+    second: _Text
+    relation: str
+
+
 _Text: TypeAlias = str | _Choice
-_Value: TypeAlias = Expression | _Text | list[ast.expr] | ast.Lambda | ast.Dict
+_Value: TypeAlias = "Expression | _Text | _Distance | ast.Lambda | list[_Value] | dict[Any, _Value] | None"
 
 
 class CodeReading(Reading):
-    """A reader of Python functions, each of which becomes a section with a tree. Code that is cut off is repaired."""
+    """A reader of Python functions, each of which becomes a section with a tree. Incomplete code is repaired."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         for start, code in code_blocks(text):
             if (module := self.parse(code.expandtabs(4).splitlines(), start)) is not None:
-                _Module(self, module)
+                _Module(self, module).note_unread(module)
 
     def parse(self, lines: list[str], start: int) -> ast.Module | None:
-        """Parse lines, the first of which has the number ``start`` + 1; cut off what follows a syntax error."""
+        """Parse lines of code, which are numbered from ``start`` + 1, and cut off the code after a syntax error."""
         first = next((number for number, line in enumerate(lines) if _START.match(line)), len(lines))
         lines[:first] = [""] * first
+        lines = [re.sub(r"^(\s*)pass (?=if\b.+\belse\b)", r"\1None ", line) for line in lines]  # as models write it
         head = "if True:" if first < len(lines) and lines[first][0] == " " else ""  # an additional line 0
         for _ in range(_MOST_REPAIRS):
             try:
@@ -106,7 +121,7 @@ _Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 class _Module:
-    """The functions of a module. Functions that other functions call are inlined; each other one is a section."""
+    """The functions of a module. Functions that other functions call are inlined; all others become sections."""
 
     def __init__(self, reading: Reading, module: ast.Module) -> None:
         self.reading, self.count, self.stack = reading, 0, list[str]()
@@ -115,20 +130,15 @@ class _Module:
         for name, function in self.functions.items():
             calls = (node for node in ast.walk(function) if isinstance(node, ast.Call))
             called |= {helper for call in calls if (helper := self.helper(call)) and helper != name}
+        classes = {node.name: node.body for node in ast.walk(module) if isinstance(node, ast.ClassDef)}
         # The names of the fields of records, such as ``Rule(when, then)``.
         self.fields = {
-            node.name: [
-                each.target.id
-                for each in node.body
-                if isinstance(each, ast.AnnAssign) and isinstance(each.target, ast.Name)
-            ]
-            for node in ast.walk(module)
-            if isinstance(node, ast.ClassDef)
+            name: [_name(each.target) for each in body if isinstance(each, ast.AnnAssign)]
+            for name, body in classes.items()
         }
         # The constants of the module and its classes; a method's ``self.SIDE`` is the constant SIDE.
         self.constants = _Scope(self, {})
-        classes = [node.body for node in module.body if isinstance(node, ast.ClassDef)]
-        for node in (node for body in (module.body, *classes) for node in body):
+        for node in (node for body in (module.body, *classes.values()) for node in body):
             if isinstance(node, ast.Assign | ast.AnnAssign) and not isinstance(node.value, ast.Call | None):
                 self.constants.statement(node)
         outside = [node for node in module.body if not isinstance(node, _Function | ast.ClassDef)]
@@ -138,8 +148,29 @@ class _Module:
                 task = "" if is_for_any_task(name) else task_name(name)
                 self.section(task, function.lineno, function.body, set())
 
+    def note_unread(self, module: ast.Module) -> None:
+        """Append a note for each call of a robot's method, and each text that begins with a verb, that neither a
+        program nor another note contains."""
+        actions = [action for section in self.reading.sections for action in actions_of(section.tree)]
+        lines = {action.line for action in actions} | {note.line for note in self.reading.notes}
+        known = "\n".join([each.text.lower() for each in actions] + [note.text.lower() for note in self.reading.notes])
+        docstrings = {id(node.value) for node in ast.walk(module) if isinstance(node, ast.Expr)}
+        for node in ast.walk(module):
+            match node:
+                case ast.Constant(value=str(text), lineno=line) if (
+                    id(node) not in docstrings
+                    and 1 < len(words := text.lower().split()) <= 40
+                    and is_verb(words)
+                    and " ".join(words) not in known
+                ):
+                    self.reading.note(line, f"no step has the action {shown(text)}")
+                case ast.Call(func=ast.Attribute(value=ast.Name(id=owner), attr=verb), lineno=line) if (
+                    owner in PYTHON["robots"] and is_verb(words_of(verb)) and line not in lines
+                ):
+                    self.reading.note(line, f"{shown(ast.unparse(node))} is left out, because no path reaches it")
+
     def helper(self, call: ast.Call) -> str:
-        """Return the name of the function of this module that is called; "" if there is none."""
+        """Return the name of the called function if this module defines it, otherwise ""."""
         function = call.func
         if isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name) and function.value.id == "self":
             return function.attr if function.attr in self.functions else ""
@@ -150,6 +181,17 @@ class _Module:
         tree = _Scope(self, dict(self.constants.values), roots).block(body)
         if next(actions_of(tree), None) is not None:
             self.reading.add_tree(task, line, tree)
+
+
+def _reverses(call: ast.Call, text: _Text) -> bool:
+    """Return whether a call checks the opposite of ``text``: check_not("..."), check("...", expected=False)."""
+    last = words_of(_name(call.func))[-1]
+    reverses = last in PYTHON["reversed"] and last not in str(text).split()
+    for each in call.keywords:
+        if isinstance(each.value, ast.Constant) and isinstance(value := each.value.value, bool):
+            key = (each.arg or "").rstrip("_")
+            reverses ^= value if key in PYTHON["negates"] else not value and key in PYTHON["expects"]
+    return reverses
 
 
 class _Scope:
@@ -184,21 +226,20 @@ class _Scope:
                 return self.expression(value)
             case ast.Return(value=value):
                 return [*(self.expression(value, is_returned=True) if value is not None else []), Jump(self.end)]
-            case ast.If(orelse=orelse):
-                chain = [node]
-                while len(orelse) == 1 and isinstance(orelse[0], ast.If):  # a loop, since a chain may be long
-                    chain.append(orelse[0])
-                    orelse = orelse[0].orelse
-                return [self.choice([(self.condition(each.test), each.body) for each in chain], orelse)]
-            case ast.Match(subject=subject, cases=cases):
-                tests = [(self.case(subject, case), case.body) for case in cases]
-                return [self.choice(tests, [])]
+            case ast.Assert(test=test):  # the rest of the function runs only if the test is true
+                return [Branch(negate(self.condition(test)), Jump(self.end))]
+            case ast.If() | ast.Match():
+                return [self.choice(*self.alternatives(node))]
             case ast.While(test=test, body=body, orelse=orelse):
                 condition = self.condition(test)
                 inner, self.values = self.branch(body)
                 return [Loop(condition, inner), *self.block(orelse).parts]
             case ast.For(target=target, iter=iterated, body=body):
                 return self.rounds(node, target, iterated, body)
+            case ast.With(items=[ast.withitem(ast.Call(func=ast.Name(id=word), args=[test]))], body=body) if (
+                word in PYTHON["guards"]
+            ):
+                return [Branch(self.guard(word, test), self.block(body))]
             case ast.With(body=body) | ast.AsyncWith(body=body):
                 return [*self.block(body).parts]
             case ast.Try(body=body, orelse=orelse, finalbody=final):
@@ -206,22 +247,32 @@ class _Scope:
             case ast.Assign(targets=[ast.Name(id=name)], value=value):
                 return self.assign(name, value)
             case ast.Assign(targets=[ast.Tuple(elts=names)], value=ast.Tuple(elts=values)):
-                pairs = [
-                    (name.id, value) for name, value in zip(names, values, strict=False) if isinstance(name, ast.Name)
-                ]
-                return [part for name, value in pairs for part in self.assign(name, value)]
+                pairs = zip(names, values, strict=False)
+                return [part for name, value in pairs for part in self.assign(_name(name), value)]
             case ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value):
                 return self.assign(name, value)
             case ast.Break():
                 return [Jump("break")]
-            case ast.Continue() | ast.Raise():
+            case ast.Raise():
+                return [Jump(self.end)]
+            case ast.Continue():
                 return [Jump()]
             case ast.AugAssign() | ast.Assign() | ast.Delete():
                 self.left_out(node, "a plan has no memory")
         return []
 
+    def alternatives(self, node: ast.If | ast.Match) -> tuple[list[tuple[Expression, list[ast.stmt]]], list[ast.stmt]]:
+        """Return the (condition, statements) pairs of a choice, and the statements after the last "else"."""
+        if isinstance(node, ast.Match):
+            return [(self.case(node.subject, case), case.body) for case in node.cases], []
+        tests, rest = list[tuple[Expression, list[ast.stmt]]](), list[ast.stmt]([node])
+        while len(rest) == 1 and isinstance(branch := rest[0], ast.If):  # a loop, since a chain may be long
+            tests.append((self.condition(branch.test), branch.body))
+            rest = branch.orelse
+        return tests, rest
+
     def choice(self, tests: Sequence[tuple[Expression, list[ast.stmt]]], otherwise: list[ast.stmt]) -> Node:
-        """Return a branch for each (condition, statements); variables get values that depend on the conditions."""
+        """Return nested branches for (condition, statements) pairs; assigned variables come to depend on conditions."""
         branches = [(condition, *self.branch(body)) for condition, body in tests]
         last = self.block(otherwise) if otherwise else None
         result: Node | None = last
@@ -252,28 +303,27 @@ class _Scope:
         return as_expression(f"{ast.unparse(subject)} matches {ast.unparse(pattern)}")
 
     def rounds(self, node: ast.stmt, target: ast.expr, iterated: ast.expr, body: list[ast.stmt]) -> list[Node]:
-        """Unroll a loop over written values; keep the body of any other loop once."""
-        items = self.items(iterated)
+        """Unroll a loop over literals; of any other loop, return the body once."""
+        items = self.value(iterated)
         names = [each.id for each in getattr(target, "elts", [target]) if isinstance(each, ast.Name)]
-        if items is None or not names:
-            self.note(node, f"the body of 'for ... in {shown(ast.unparse(iterated))}' is kept once, without its count")
+        if not isinstance(items, list) or not names:
+            self.note(node, f"the body of 'for ... in {shown(ast.unparse(iterated))}' is kept once instead of repeated")
             return [*self.block(body).parts]
         parts = list[Node]()
         for each in items if self.count(len(items)) else ():
-            pairs = zip(names, self.items(each) or [] if isinstance(target, ast.Tuple) else [each], strict=False)
-            self.values |= {name: self.value(value) for name, value in pairs}
+            values = [each] if isinstance(target, ast.Name) else each if isinstance(each, list) else []
+            self.values |= dict(zip(names, values, strict=False))
             parts += self.block(body).parts
         return parts
 
     def count(self, number: int) -> bool:
-        """Count inlined parts, and return whether there are few enough."""
+        """Add to the count of inlined parts, and return whether it is within the limit."""
         self.module.count += number
         return self.module.count <= _MOST_INLINED
 
     def assign(self, name: str, value: ast.expr) -> list[Node]:
-        if isinstance(value, ast.Await):
-            value = value.value
-        called = isinstance(value, ast.Call) and not self.module.helper(value) and self.argument(value) is None
+        value = value.value if isinstance(value, ast.Await) else value
+        called = isinstance(value, ast.Call) and not self.module.helper(value) and self.words(value) is None
         if called and self.is_action(value) and not _is_check(value):  # type: ignore[arg-type]
             return self.expression(value)
         self.values[name] = self.value(value)
@@ -282,48 +332,65 @@ class _Scope:
     # Actions
 
     def expression(self, node: ast.expr, is_returned: bool = False) -> list[Node]:
-        """Return the actions of an expression that is a statement, or that is returned."""
+        """Return the actions of an expression that is a statement or the value of a ``return``."""
         match node:
             case ast.Await(value=value) | ast.Yield(value=ast.expr() as value):
                 return self.expression(value, True)
             case ast.IfExp(test=test, body=body, orelse=orelse):
                 branches = [Block(tuple(self.expression(each, is_returned))) for each in (body, orelse)]
                 return [Branch(self.condition(test), *branches)]
+            case ast.BoolOp(op=ast.And(), values=[*first, last]):  # "check(...) and robot.close(...)"
+                return [Branch(all_of(map(self.condition, first)), Block(tuple(self.expression(last, is_returned))))]
+            case ast.BoolOp(values=operands):
+                return [self.first(operands)]
             case ast.Tuple(elts=values) | ast.List(elts=values) if is_returned:
                 return [part for value in values for part in self.expression(value, True)]
             case ast.Call() if name := self.module.helper(node):
                 return self.inline(node, name)
-            case ast.Call(func=function) if isinstance(known := self.entry(function), ast.Lambda) and self.count(1):
+            case ast.Call(keywords=named) if guards := [each for each in named if each.arg in PYTHON["guards"]]:
+                action = ast.copy_location(ast.Call(node.func, node.args, [x for x in named if x not in guards]), node)
+                tests = [self.guard(str(each.arg), each.value) for each in guards]
+                return [Branch(all_of(tests), Block(tuple(self.expression(action, is_returned))))]
+            case ast.Call(func=function) if isinstance(known := self.value(function), ast.Lambda) and self.count(1):
                 return self.expression(known.body, is_returned)
-            case ast.Call() if self.text(node) is None:
+            case ast.Call(func=ast.Attribute(value=owner, attr="get")) if isinstance(self.value(owner), dict):
+                pass
+            case ast.Call():
                 return self.call(node)
-        text = self.text(node) if is_returned else None
-        return [] if text is None else [_action(text, node.lineno)]
+        text = self.words(node) if is_returned else None
+        return [] if text is None or isinstance(text, _Name) else [_action(text, node.lineno)]
+
+    def first(self, values: Sequence[ast.expr]) -> Node:
+        """Return the first action of "grasp(...) or lift(...) or 'wait'": a helper that returns None is passed over."""
+        result: Node = Block()
+        for each in reversed(values):
+            text = self.value(each)
+            if isinstance(text, str | _Choice) and not isinstance(text, _Name):
+                result = _action(text, each.lineno, otherwise=result)
+            elif isinstance(text, Expression) and (not isinstance(each, ast.Call) or _is_check(each)):
+                result = Branch(negate(text), result)  # "check(...) or robot.grasp(...)"
+            else:
+                result = Block((*self.expression(each, True), result))
+        return result
 
     def call(self, node: ast.Call) -> list[Node]:
-        """Return the action of a call of a skill."""
-        function = " ".join(words_of(_name(node.func)))
-        if function in PYTHON["ignored"] or function.split(" ")[-1] in PYTHON["ignored"]:
+        """Convert the call of a skill to actions."""
+        verb = words_of(_name(node.func))
+        if not {" ".join(verb), *verb[-1:]}.isdisjoint(PYTHON["ignored"]):
             return []
-        if not function or not self.is_action(node):
+        if not verb or not self.is_action(node):
             self.left_out(node, "the call is not a skill")
             return []
-        receiver, verb = self.receiver(node.func), words_of(_name(node.func))
-        if _is_carrier(node):
-            receiver, verb = "", [""]
-        named = {
-            each.arg: text for each in node.keywords if each.arg and (text := self.argument(each.value)) is not None
-        }
+        receiver, verb = ("", [""]) if _is_carrier(node) else (self.receiver(node.func), verb)
+        words, named = self.arguments(node)
         if verb == ["move", "gripper"]:
-            place = [text for each in node.args if isinstance(text := self.argument(each), str)]
             flags = {each.arg: ast.unparse(each.value) for each in node.keywords if each.arg}
-            skill, goal = state_to_reach(
-                " ".join(place), flags | {k: v for k, v in named.items() if isinstance(v, str)}
-            )
+            texts = {name: text for name, text in named.items() if isinstance(text, str)}
+            place = " ".join(text for text in words if isinstance(text, str))
+            skill, goal = state_to_reach(place, flags | texts)
             return [Action(skill, node.lineno, goal)]
         goal = str(named.pop("goal", ""))
-        parts: list[_Text] = [verb[0], receiver, " ".join(verb[1:])]
-        parts += [text for each in node.args if (text := self.argument(each)) is not None]
+        parts: list[_Text] = [verb[0], receiver, " ".join(verb[1:]), *words]
         for name, text in named.items():
             if name in _COMMENTS:
                 continue
@@ -338,33 +405,17 @@ class _Scope:
 
     def receiver(self, node: ast.expr) -> _Text:
         """Return the words before a method's name, without the robot: "gripper" in ``robot.gripper.close()``."""
-        return (self.argument(node.value) or "") if isinstance(node, ast.Attribute) else ""
+        return (self.words(node.value) or "") if isinstance(node, ast.Attribute) else ""
 
-    def argument(self, node: ast.expr) -> _Text | None:
-        """Return the words of a call's argument; None for numbers and the like."""
-        match node:
-            case ast.Constant(value=value):
-                return value if isinstance(value, str) else None
-            case ast.Name(id=name) if name not in self.values:
-                return None if _is_owner(name) else PYTHON["names"].get(name) or " ".join(words_of(name))
-            case ast.Attribute(value=ast.Name(id="self"), attr=name) if name in self.module.constants.values:
-                return self.argument(ast.Name(name))
-            case ast.Attribute() | ast.Subscript() if self.entry(node) is not None:
-                return self.text(node)
-            case ast.Attribute(attr=name):
-                words = [] if name in PYTHON["fields"] or _is_owner(name) else [" ".join(words_of(name))]
-                return _joined([self.receiver(node), *words])
-            case ast.Subscript(value=value, slice=key) if self.table(value) is None:
-                return self.argument(key)
-            case ast.Call() if words_of(_name(node.func))[:1] in (["get"], ["find"], ["object"]) and node.args:
-                return self.argument(node.args[0])
-        return self.text(node)
+    def arguments(self, node: ast.Call) -> tuple[list[_Text], dict[str, _Text]]:
+        """Return the words of a call's arguments and of its keyword arguments."""
+        words = [text for each in node.args if (text := self.words(each)) is not None]
+        pairs = [(each.arg, self.words(each.value)) for each in node.keywords if each.arg]
+        return words, {name: text for name, text in pairs if text is not None}
 
     def inline(self, node: ast.Call, name: str) -> list[Node]:
         """Return the actions of a helper function."""
-        if name in self.roots:
-            return []
-        if (scope := self.inner(node, name)) is None:
+        if name in self.roots or (scope := self.inner(node, name)) is None:
             return []
         scope.end = f"return {self.module.count}"
         self.module.stack.append(name)
@@ -380,184 +431,188 @@ class _Scope:
         arguments = self.module.functions[name].args
         names = [each.arg for each in (*arguments.posonlyargs, *arguments.args) if each.arg not in ("self", "cls")]
         defaults = dict(zip(reversed(names), reversed(arguments.defaults), strict=False))
-        written = (
-            defaults | dict(zip(names, node.args, strict=False)) | {e.arg: e.value for e in node.keywords if e.arg}
-        )
-        values = {key: self.value(each) for key, each in written.items() if self.argument(each) != ""}
+        written = defaults | dict(zip(names, node.args, strict=False))
+        written |= {each.arg: each.value for each in node.keywords if each.arg}
+        values = {key: self.value(each) for key, each in written.items()}
+        values = {key: value for key, value in values.items() if value is not None or _name(written[key]) == ""}
         outer = {key: value for key, value in self.values.items() if key not in names}
         return _Scope(self.module, outer | values)
 
     # Values
 
-    def value(self, node: ast.expr) -> _Value:
-        """Return the value of an expression: a text, a list, a table, a function, or otherwise a condition."""
-        match node:
-            case ast.Lambda() | ast.Dict():
-                return node
-            case ast.Call() if (table := self.table(node)) is not None:
-                return table
-            case ast.Constant(value=None):
-                return ""
-            case ast.Call() if name := self.module.helper(node):
-                return self.called(node, name)
-        text = self.argument(node)
-        if text is not None:
-            return text
-        items = self.items(node)
-        return self.condition(node) if items is None else items
-
-    def table(self, node: ast.expr) -> ast.Dict | None:
-        """Return a written dictionary; a record such as ``Rule(when=..., then=...)`` is one, too."""
-        node = self.entry(node) or node
-        if isinstance(node, ast.Call) and (fields := self.module.fields.get(_name(node.func))):
-            pairs = dict(zip(fields, node.args, strict=False)) | {e.arg: e.value for e in node.keywords if e.arg}
-            return ast.Dict([ast.Constant(name) for name in pairs], [*pairs.values()])
-        return node if isinstance(node, ast.Dict) else None
-
-    def entry(self, node: ast.expr) -> ast.expr | None:
-        """Return the table or function that a name stands for, or the entry of a table at a written key."""
-        match node:
-            case ast.Name(id=name) | ast.Attribute(value=ast.Name(id="self"), attr=name):
-                value = self.values.get(name)
-                return value if isinstance(value, ast.expr) else None
-            case ast.Attribute(value=ast.Name(id=owner), attr=name) if owner in self.module.fields:  # Phase.PUSH
-                return ast.copy_location(ast.Name(name), node) if name in self.module.constants.values else None
-            case ast.Attribute(value=owner, attr="value") if self.text(owner) is not None:  # of an enumeration
-                return owner
-            case ast.Attribute(value=owner, attr=key) | ast.Subscript(value=owner, slice=ast.Constant(value=key)):
-                if (table := self.table(owner)) is not None:
-                    pairs = zip(table.keys, table.values, strict=True)
-                    return next((each for k, each in pairs if isinstance(k, ast.Constant) and k.value == key), None)
-        return None
-
-    def text_at(self, table: ast.Dict, key: _Value) -> _Text | None:
-        """Return the text in a table for a key that may depend on conditions."""
-        if isinstance(key, _Choice):
-            then, otherwise = self.text_at(table, key.then), self.text_at(table, key.otherwise)
-            return _Choice(key.condition, then or "", otherwise or "") if then or otherwise else None
-        texts = {self.argument(each): value for each, value in zip(table.keys, table.values, strict=True) if each}
-        return self.text(texts[key]) if isinstance(key, str) and key in texts else None
-
-    def items(self, node: ast.expr) -> list[ast.expr] | None:
-        """Return the elements of a written list."""
-        if isinstance(node, ast.Name) and isinstance(value := self.values.get(node.id), list):
-            return value
-        return node.elts if isinstance(node, ast.List | ast.Tuple | ast.Set) else None
-
-    def text(self, node: ast.expr) -> _Text | None:
-        """Return the value of an expression that is a string; None for any other expression."""
-        match node:
-            case ast.Constant(value=str(value)):
-                return value
-            case ast.Name(id=name):
-                known = self.values.get(name)
-                return known if isinstance(known, str | _Choice) else None
-            case ast.Attribute() | ast.Subscript() if (entry := self.entry(node)) is not None:
-                return self.text(entry)
-            case ast.Subscript(value=value, slice=key) if (table := self.table(value)) is not None:
-                return self.text_at(table, self.value(key))
-            case ast.Call() if name := self.module.helper(node):
-                returned = self.called(node, name)
-                return returned if isinstance(returned, str | _Choice) else None
-            case ast.Call(func=ast.Attribute(value=value, attr="get"), args=[key, *_]) if table := self.table(value):
-                return self.text_at(table, self.value(key))
-            case ast.JoinedStr(values=values):
-                return _joined([text for each in values if (text := self.argument(each)) is not None], "")
-            case ast.FormattedValue(value=value):
-                return self.argument(value)
-            case ast.BinOp(left=left, op=ast.Add(), right=right):
-                pair = [self.text(left), self.text(right)]
-                return None if None in pair else _joined([text for text in pair if text is not None], "")
-            case ast.IfExp(test=test, body=body, orelse=orelse):
-                then, otherwise = self.text(body), self.text(orelse)
-                return None if then is None or otherwise is None else _Choice(self.condition(test), then, otherwise)
-        return None
+    def words(self, node: ast.expr) -> _Text | None:
+        """Return the text of an expression; None for an expression without words, such as a number."""
+        value = self.value(node)
+        return value if isinstance(value, str | _Choice) else None
 
     def condition(self, node: ast.expr) -> Expression:
-        """Return the condition of an expression. Code that is not a condition becomes a leaf with its source."""
+        """Convert an expression to a condition. Code that cannot be converted becomes a leaf with the source text."""
+        value = self.value(node)
+        return _truth(value) if isinstance(value, Expression | str | _Choice) else as_expression(ast.unparse(node))
+
+    def value(self, node: ast.expr) -> _Value:
+        """Return the value of an expression; None if it has no meaning in a plan."""
         match node:
-            case ast.Await(value=value):
-                return self.condition(value)
-            case ast.BoolOp(op=op, values=values):
-                return (all_of if isinstance(op, ast.And) else any_of)(map(self.condition, values))
-            case ast.UnaryOp(op=ast.Not(), operand=operand):
-                return negate(self.condition(operand))
+            case ast.Await(value=value) | ast.FormattedValue(value=value):
+                return self.value(value)
+            case ast.Constant(value=value):
+                return value if isinstance(value, str) else "" if value is None else _constant(value)
+            case ast.Lambda():
+                return node
+            case ast.List(elts=parts) | ast.Tuple(elts=parts) | ast.Set(elts=parts):
+                return [self.value(part) for part in parts]
+            case ast.Dict(keys=keys, values=values):
+                return {self.key(key): self.value(each) for key, each in zip(keys, values, strict=True) if key}
+            case ast.Name(id=name):
+                unknown = PYTHON["names"].get(name) or " ".join(words_of(name))
+                return self.values[name] if name in self.values else None if _is_owner(name) else _Name(unknown)
+            case ast.Attribute() | ast.Subscript():
+                return self.part(node)
+            case ast.Call():
+                return self.result(node)
+            case ast.JoinedStr(values=values):
+                return _joined([text for each in values if (text := self.words(each)) is not None], "")
+            case ast.BinOp(left=left, op=ast.Add(), right=right):
+                texts = [text for each in (left, right) if (text := self.words(each)) is not None]
+                return _joined(texts, "") if len(texts) == 2 else None
             case ast.IfExp(test=test, body=body, orelse=orelse):
+                then, otherwise = self.words(body), self.words(orelse)
+                if then is not None and otherwise is not None:
+                    return _Choice(self.condition(test), then, otherwise)
                 return choose(*map(self.condition, (test, body, orelse)))
             case ast.NamedExpr(target=ast.Name(id=name), value=value):
-                self.values[name] = self.condition(value)
-                return self.condition(ast.Name(name))
-            case ast.Constant(value=bool(value)):
-                return TRUE if value else FALSE
-            case ast.Constant(value=int(value)):
-                return TRUE if value else FALSE
-            case ast.Name(id=name) if isinstance(known := self.values.get(name), Expression):
-                return known
-            case ast.Compare(left=left, ops=[ast.Is() | ast.Eq()], comparators=[ast.Constant(value=bool(value))]):
-                return self.condition(left) if value else negate(self.condition(left))
-            case ast.Compare(left=ast.Call(args=[_, _]) as call, ops=[op]) if words_of(_name(call.func))[:1] in (
-                ["distance"],
-                ["dist"],
+                self.values[name] = self.value(value)
+                return self.values[name]
+            case ast.BoolOp(op=op, values=values):
+                return (all_of if isinstance(op, ast.And) else any_of)(map(self.condition, values))
+            case (
+                ast.UnaryOp(op=ast.Not() | ast.Invert(), operand=operand)
+                | ast.BinOp(left=ast.Constant(value=1), op=ast.Sub(), right=operand)
             ):
-                pair = [text for each in call.args if (text := self.argument(each)) is not None]
-                near = _leaf(_joined([*pair[:1], "near", *pair[1:]]))
-                self.note(node, f"the threshold in {shown(ast.unparse(node))} is read as that of 'near'")
-                return near if isinstance(op, ast.Lt | ast.LtE) else negate(near)
-            case ast.Compare(left=ast.Name(id=name), ops=[op], comparators=[right]) if (
-                isinstance(known := self.values.get(name), str | _Choice)
-                and (isinstance(known, _Choice) or ast.unparse(right) == "None")
-                and isinstance(other := self.value(right), str)
-            ):
-                equal = _equals(known, other)
-                return negate(equal) if isinstance(op, ast.NotEq | ast.IsNot) else equal
-            case ast.Compare(left=left, ops=[ast.Is() | ast.Eq() | ast.NotEq() as op], comparators=[right]):
-                words = [self.argument(left), "is", self.argument(right)]
-                if None not in words:
-                    leaf = _leaf(_joined([word for word in words if word is not None]))
-                    return negate(leaf) if isinstance(op, ast.NotEq) else leaf
+                return negate(self.condition(operand))
+            case ast.BinOp(left=left, op=ast.BitXor(), right=right):
+                one, other = self.condition(left), self.condition(right)
+                return choose(one, negate(other), other)
+            case ast.Compare(left=left, ops=[op], comparators=[right]):
+                return self.comparison(node, left, op, right)
+        return None
+
+    def key(self, node: ast.expr) -> Any:
+        """Return the value of a key in a table."""
+        return node.value if isinstance(node, ast.Constant) else self.words(node)
+
+    def part(self, node: ast.Attribute | ast.Subscript) -> _Value:
+        """Return an entry of a table or record, the value of a property, or else the words of ``puck.position``."""
+        owner = self.value(node.value)
+        if isinstance(node, ast.Subscript):
+            if isinstance(node.slice, ast.Slice):
+                return owner
+            return _lookup(owner, self.key(node.slice)) if isinstance(owner, dict) else self.value(node.slice)
+        if isinstance(owner, dict) and node.attr in owner:
+            return owner[node.attr]
+        if self.module.helper(call := ast.copy_location(ast.Call(node, [], []), node)):
+            return self.value(call)
+        if _name(node.value) in ("self", *self.module.fields) and node.attr in self.module.constants.values:
+            return self.values.get(node.attr)
+        is_named = node.attr not in PYTHON["fields"] and not _is_owner(node.attr)
+        words = _joined([self.receiver(node), " ".join(words_of(node.attr)) if is_named else ""])
+        return _Name(words) if words and isinstance(words, str) else words or None
+
+    def result(self, node: ast.Call) -> _Value:
+        """Return the result of a call: of a helper, a function of Python, a table's ``get``, or a question."""
+        if name := self.module.helper(node):
+            return self.called(node, name)
+        if fields := self.module.fields.get(_name(node.func)):
+            pairs = dict(zip(fields, node.args, strict=False)) | {
+                each.arg: each.value for each in node.keywords if each.arg
+            }
+            return {key: self.value(each) for key, each in pairs.items()}
+        match node:
             case ast.Call(func=ast.Name(id="any" | "all" as name), args=[argument]):
                 return (any_of if name == "any" else all_of)(self.parts(argument))
-            case ast.Call(func=ast.Name(id="bool"), args=[argument]):
-                return self.condition(argument)
-            case ast.Attribute() | ast.Subscript() if (entry := self.entry(node)) is not None:
-                return self.condition(entry)
-            case ast.Call(func=function, args=args) if isinstance(called := self.entry(function), ast.Lambda):
-                names = [each.arg for each in called.args.args]
-                inner = {key: self.value(each) for key, each in zip(names, args, strict=False)}
-                return _Scope(self.module, self.values | inner).condition(called.body) if self.count(1) else FALSE
-            case ast.Call() if name := self.module.helper(node):
-                return _truth(self.called(node, name))
-            case ast.Call() if (text := self.question(node)) is not None:
-                return _leaf(text)
-            case ast.Attribute() if self.module.helper(property := ast.Call(node, [], [])):
-                return self.condition(ast.copy_location(property, node))
-            case ast.Attribute() if (text := self.argument(node)) is not None:
-                return _leaf(text)
-        text = self.text(node)
-        return as_expression(ast.unparse(node)) if text is None else _leaf(text)
+            case ast.Call(func=ast.Name(id="bool" | "int" | "float" | "abs" | "str"), args=[argument]):
+                return self.value(argument)
+            case ast.Call(func=ast.Attribute(value=owner, attr="get"), args=[key, *default]) if isinstance(
+                table := self.value(owner), dict
+            ):
+                return _lookup(table, self.key(key), self.value(default[0]) if default else None)
+            case ast.Call(func=ast.Attribute(attr="norm"), args=[ast.BinOp(left=left, op=ast.Sub(), right=right)]):
+                return self.distance(left, right)
+            case ast.Call(args=[left, right]) if {"dist", "distance"} & {*words_of(_name(node.func))}:
+                return self.distance(left, right)
+            case ast.Call(args=[argument, *_]) if words_of(_name(node.func))[:1] in (["get"], ["find"], ["object"]):
+                text = self.words(argument)
+                return _Name(text) if isinstance(text, str) else text
+            case ast.Call(func=function, args=args) if isinstance(called := self.value(function), ast.Lambda):
+                inner = {each.arg: self.value(value) for each, value in zip(called.args.args, args, strict=False)}
+                return _Scope(self.module, self.values | inner).value(called.body) if self.count(1) else FALSE
+        if (text := self.question(node)) is None:
+            return None
+        return negate(_leaf(text)) if _reverses(node, text) else _leaf(text)
+
+    def distance(self, *nodes: ast.expr) -> _Distance | None:
+        pair = [self.words(each) for each in nodes]
+        is_flat = all(isinstance(each, ast.Subscript) and ast.unparse(each.slice) == ":2" for each in nodes)
+        relation = "vertically aligned with" if is_flat else "near"
+        return _Distance(*pair, relation) if all(pair) else None  # type: ignore[arg-type, call-arg]
+
+    def comparison(self, node: ast.Compare, left: ast.expr, op: ast.cmpop, right: ast.expr) -> Expression | None:
+        """Convert a comparison with a truth value, a threshold, or the text of a variable to a condition."""
+        differs, is_equality = (
+            isinstance(op, ast.NotEq | ast.IsNot),
+            isinstance(op, ast.Eq | ast.Is | ast.NotEq | ast.IsNot),
+        )
+        value, other = self.value(left), self.value(right)
+        condition: Expression | None = None
+        truth = right.value if isinstance(right, ast.Constant) else None
+        if is_equality and (isinstance(truth, bool) or (truth in (0, 1) and isinstance(left, ast.Call))):
+            condition = self.condition(left)
+            differs ^= not truth  # int(check("...")) == 0
+        elif isinstance(op, ast.Lt) and truth == 1 and isinstance(value, Expression):
+            condition, differs = value, True
+        elif isinstance(value, _Distance):
+            condition, differs = (
+                _leaf(_joined([value.first, value.relation, value.second])),
+                not isinstance(op, ast.Lt | ast.LtE),
+            )
+            self.note(node, f"the threshold in {shown(ast.unparse(node))} is read as that of {value.relation!r}")
+        elif isinstance(value, _Choice | str) and isinstance(other, _Choice | str):
+            is_known = isinstance(value, _Choice) or (ast.unparse(right) == "None" and not isinstance(value, _Name))
+            if is_known and isinstance(other, str):
+                condition = _each(value, lambda each: TRUE if each == other else FALSE, choose)
+            elif is_equality and ast.unparse(right) != "None":
+                condition = _leaf(_joined([value, "is", other]))
+        return condition if condition is None or not differs else negate(condition)
+
+    def guard(self, word: str, test: ast.expr) -> Expression:
+        """Apply a word such as "unless" to a test, and return the resulting condition."""
+        return negate(self.condition(test)) if word == "unless" else self.condition(test)
 
     def parts(self, node: ast.expr) -> list[Expression]:
         """Return the conditions in the argument of ``any`` or ``all``."""
         if isinstance(node, ast.GeneratorExp | ast.ListComp) and len(node.generators) == 1:
             loop = node.generators[0]
-            items = self.items(loop.iter)
-            if items is not None and isinstance(loop.target, ast.Name) and self.count(len(items)):
-                values = [{loop.target.id: self.value(each)} for each in items]
-                return [_Scope(self.module, self.values | value).condition(node.elt) for value in values]
-        items = self.items(node)
-        return [self.condition(node)] if items is None else [self.condition(each) for each in items]
+            items = self.value(loop.iter)
+            if isinstance(items, list) and isinstance(loop.target, ast.Name) and self.count(len(items)):
+                scopes = (_Scope(self.module, self.values | {loop.target.id: each}) for each in items)
+                return [scope.condition(node.elt) for scope in scopes]
+        items = self.value(node)
+        return [*map(_truth, items)] if isinstance(items, list) else [self.condition(node)]
 
     def question(self, node: ast.Call) -> _Text | None:
         """Return the words of a call in a condition: "gripper is above puck" for ``gripper.is_above(puck)``."""
-        words = [text for each in node.args if (text := self.argument(each)) is not None]
-        words += [text for each in node.keywords if (text := self.argument(each.value)) is not None]
+        words, named = self.arguments(node)
+        manner = [text for name, text in named.items() if name in PYTHON["manners"]]
+        words += [text for name, text in named.items() if name not in PYTHON["manners"]]
         is_sentence = len(words) > 2 or any(isinstance(each, str) and len(each.split()) > 3 for each in words)
         if words and (_is_check(node) or is_sentence):
             return _joined(words)
         receiver, name = self.receiver(node.func), words_of(_name(node.func))
+        if words and name[-1] not in _RELATIONS and not is_noun(str(receiver)) and is_noun(str(words[0])):
+            receiver = ""  # "vision.is_closed(gripper)"
         if len(words) > 1 or (words and not receiver and name[-1:] != ["holding"] and name[-1] not in _RELATIONS):
             receiver, *words = words
-        return _joined([receiver, " ".join(name), *words]) or None
+        return _joined([receiver, *manner, " ".join(name), *words]) or None
 
     def called(self, node: ast.Call, name: str) -> _Value:
         """Return the value that a helper function returns."""
@@ -574,11 +629,18 @@ class _Scope:
             match statement:
                 case ast.Return(value=value):
                     return FALSE if value is None else self.value(value)
-                case ast.If(test=test, body=then, orelse=orelse):
-                    rest, condition = body[number + 1 :], self.condition(test)
-                    inner = _Scope(self.module, dict(self.values))
-                    return _chosen(condition, inner.returned([*then, *rest]), self.returned([*orelse, *rest]))
-                case ast.Assign(targets=[ast.Name(id=name)], value=value):
+                case ast.If() | ast.Match():
+                    (tests, otherwise), rest = self.alternatives(statement), body[number + 1 :]
+                    scopes = [(test, then, _Scope(self.module, dict(self.values))) for test, then in tests]
+                    branches = [(test, scope.returned([*then, *rest])) for test, then, scope in scopes]
+                    returned = self.returned([*otherwise, *rest])
+                    for test, then in reversed(branches):
+                        returned = _chosen(test, then, returned)
+                    return returned
+                case (
+                    ast.Assign(targets=[ast.Name(id=name)], value=value)
+                    | ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value)
+                ):
                     self.values[name] = self.value(value)
         return FALSE
 
@@ -600,7 +662,9 @@ def _is_carrier(node: ast.Call) -> bool:
 
 def _is_check(node: ast.Call) -> bool:
     """Return whether a call asks a question in words, such as ``check("...")``."""
-    return " ".join(words_of(_name(node.func))) in PYTHON["checks"]
+    words = words_of(_name(node.func))
+    words = words[:-1] if len(words) > 1 and words[-1] in PYTHON["reversed"] else words
+    return " ".join(words) in PYTHON["checks"]
 
 
 def _joined(parts: Sequence[_Text], gap: str = " ") -> _Text:
@@ -614,33 +678,52 @@ def _joined(parts: Sequence[_Text], gap: str = " ") -> _Text:
     return gap.join(str(part) for part in parts if part != "")
 
 
+def _each(text: _Text, function: Callable[[str], Any], join: Callable[[Expression, Any, Any], Any]) -> Any:
+    """Apply a function to each string that a text can be, and join the results by the conditions."""
+    if isinstance(text, _Choice):
+        return join(text.condition, *(_each(part, function, join) for part in (text.then, text.otherwise)))
+    return function(text)
+
+
+def _lookup(table: dict[Any, _Value], key: Any, default: _Value = None) -> _Value:
+    """Return the entry of a table at a key that may depend on conditions."""
+
+    def join(condition: Expression, then: _Value, otherwise: _Value) -> _Value:
+        return _chosen(condition, then or "", otherwise or "")
+
+    return _each(key, lambda each: table.get(each, default), join)
+
+
 def _leaf(text: _Text) -> Expression:
-    """Return a condition in words."""
-    if isinstance(text, _Choice):
-        return choose(text.condition, _leaf(text.then), _leaf(text.otherwise))
-    return as_expression(" ".join(text.split())) if text else FALSE
+    """Return the condition that a text states."""
+    return _each(text, lambda words: as_expression(" ".join(words.split())) if words else FALSE, choose)
 
 
-def _equals(text: _Text, other: str) -> Expression:
-    """Return the condition that a text is equal to another one."""
-    if isinstance(text, _Choice):
-        return choose(text.condition, _equals(text.then, other), _equals(text.otherwise, other))
-    return TRUE if text == other else FALSE
+def _action(text: _Text, line: int, goal: str = "", otherwise: Node = Block()) -> Node:  # noqa: B008
+    """Return the action that a text states; ``otherwise`` where the text is empty."""
+
+    def action(words: str) -> Node:
+        return Action(" ".join(words.split()), line, goal) if words or goal else otherwise
+
+    return _each(text, action, Branch)
 
 
 def _truth(value: _Value) -> Expression:
-    """Return a value as a condition."""
+    """Convert a value to a condition."""
     return _leaf(value) if isinstance(value, str | _Choice) else value if isinstance(value, Expression) else FALSE
 
 
-def _action(text: _Text, line: int, goal: str = "") -> Node:
-    if isinstance(text, _Choice):
-        return Branch(text.condition, _action(text.then, line, goal), _action(text.otherwise, line, goal))
-    return Action(" ".join(text.split()), line, goal) if text or goal else Block()
+def _constant(value: object) -> Expression | None:
+    return None if not isinstance(value, int) else TRUE if value else FALSE
 
 
-def _chosen(condition: Expression, then: _Value, otherwise: _Value | None) -> _Value:
+def _chosen(condition: Expression, then: _Value, otherwise: _Value) -> _Value:
     """Return the value of a variable after a branch."""
+    # A function that returns a text only in one branch returns None, an empty text, in the other.
+    then, otherwise = (
+        "" if one == FALSE and isinstance(other, str | _Choice) else one
+        for one, other in ((then, otherwise), (otherwise, then))
+    )
     if isinstance(then, Expression) or isinstance(otherwise, Expression):
         return then if otherwise is None else choose(condition, _truth(then), _truth(otherwise))
     if isinstance(then, str | _Choice) and isinstance(otherwise, str | _Choice) and then != otherwise:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from lw_torchrl._util.checks import shown
 from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, Styled, item
+from lw_torchrl.language.formats.markup import BULLET, WHEN, sentences, table_rules
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, one_line
 from lw_torchrl.language.tasks import TASKS, Task
@@ -49,25 +50,25 @@ def _write(plan: ConditionalPlan, style: Style) -> str:
 # Headings: "The task `push`: ...", or a task's name on a line of its own.
 _NAMED = re.compile(r"[\s#>*\"'`]*(?:the\s+)?task\b[\s:]*([`\"'“‘*]*)([A-Za-z0-9][\w-]*(?:/[\w-]+)?)", re.IGNORECASE)
 _ALONE = re.compile(r"[\s#>*\"'`]*([a-z0-9]+(?:[-_][a-z0-9]+)*)[\s\"'`:,*]*")
-_BULLET = re.compile(r"\s*(?:[-*•–+>]|\(?\[?\d{1,3}[.)\]]|[a-z]\))\s+")
-_WHEN = re.compile(
-    r"(?:<[^<>]*>|[\"'`*])*(?:(?:finally|then|next|first|lastly|and|or|else),?\s+)?"
-    r"(when|whenever|if|once|while|as long as|as soon as|after)\s+(.+)",
-    re.IGNORECASE,
-)
 _SHOULD = re.compile(
     r",?\s(?:then\s)?(?:the\s)?(?:robot|it)\s(?:should|must|needs to|has to|will|can|shall)\s(?:then\s|just\s)?",
     re.IGNORECASE,
 )
 _UNTIL = re.compile(r",?\s(?:then\s)?move\s(?:the\s)?(?:robot's\s)?gripper\suntil\s", re.IGNORECASE)
 _COMMA = re.compile(r",\s(?:then\s)?")
+MAY_BE_RULE = re.compile(
+    r"\W*(?:(?:first|then|next|finally),?\s+)?(?:(?:it|the robot) should\b.*|[a-z]+ [^,.;]*)?"
+    r"\b(?:when|whenever|if|once|in case|given|provided|as (?:long|soon) as|unless|upon|should|while|on)\b"
+    r"[^.;]*\b(?:is|are|be)\b[^.;]*[.]?$|[^?]*\?\s+\w",
+    re.IGNORECASE,
+)
 # A sentence that begins with one of these words after "When C, " is not a skill.
 NO_SKILL = frozenset(("the", "a", "an", "it", "this", "that", "you", "we", "they", "there", "and", "or"))
 
 
 def _is_read(line: str) -> bool:
     """Return whether the reader would parse a line as part of a plan rather than as a comment."""
-    match = END.search(line) or _heading(line) or _BULLET.match(line) or item(line) or _clause(1, line, bullet=False)
+    match = END.search(line) or _heading(line) or BULLET.match(line) or item(line) or _clause(1, line, bullet=False)
     return bool(match) or _listing(line) is not None
 
 
@@ -83,9 +84,10 @@ class ProseReading(Reading):
         self.bulleted: dict[int, bool] = {}  # section number to whether the section's clauses are bullets
         self.reason: list[str] = []
         self.listing = False
-        for number, line in enumerate(text.splitlines(), 1):
+        for number, line in enumerate(table_rules(text).splitlines(), 1):
             before, *cut = END.split(line, maxsplit=1)
-            self.read(number, before.strip())
+            for sentence in sentences(before.strip()):
+                self.read(number, sentence)
             if cut:
                 self.note(number, "the answer ends here; later text is ignored")
                 break
@@ -93,7 +95,7 @@ class ProseReading(Reading):
     def read(self, number: int, raw: str) -> None:
         """Parse one line."""
         line = " ".join(raw.split())
-        bullet = _BULLET.match(line)
+        bullet = BULLET.match(line)
         if name := _heading(line):
             self.open(name, number)
             self.listing = False
@@ -109,6 +111,8 @@ class ProseReading(Reading):
             self.note(number, f"a rule without a condition or without a skill is left out: {shown(line)}")
         elif line and not line.startswith(("```", "~~~")) and not line.endswith(":"):
             self.reason.append(line)
+            if len(line) <= 500 and MAY_BE_RULE.match(line):
+                self.note(number, f"a sentence is not read as a rule: {shown(line)}")
         self.listing = self.listing and steps is not None
 
     def add(self, clause: Clause, bullet: bool, line: str) -> None:
@@ -141,8 +145,8 @@ def _listing(line: str) -> str | None:
 
 def _clause(number: int, line: str, bullet: bool) -> Clause | None:
     """Parse a line as a clause; return None if the line is not a clause."""
-    start = _BULLET.match(line)
-    match = _WHEN.match(line, start.end() if start else 0)
+    start = BULLET.match(line)
+    match = WHEN.match(line, start.end() if start else 0)
     if not match:
         return None
     rest = match[2]

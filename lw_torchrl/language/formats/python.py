@@ -5,7 +5,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from lw_torchrl._util.checks import shown
-from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, Styled, item, task_name
+from lw_torchrl.language.formats.base import (
+    END,
+    PROGRAM_WORDS,
+    Clause,
+    PlanFormat,
+    Reading,
+    Style,
+    Styled,
+    item,
+    task_name,
+)
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep, function_head, one_line, quote
 from lw_torchrl.language.queries import Query
@@ -97,7 +107,10 @@ _CHECK = re.compile(rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check
 _CALL = re.compile(r"(?:self\.)?robot\.(\w+)\s*\(\s*")
 # A comment that may begin the section of a task: "# drawer-open: ...".
 _HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
-_CONTROL = re.compile(r"(?:return|break|continue)\b|[a-z_]\w*\s*=(?!=)|(?:elif|else)\b")
+_CONTROL = re.compile(r"(?:return|break|continue|raise|assert|with)\b|[a-z_]\w*\s*=(?!=)|(?:elif|else)\b")
+_DOCSTRING = re.compile(
+    r"^[ \t]*(?:\w+[ \t]*=[ \t]*)?[rRuU]?(?:\"{3}[\s\S]*?\"{3}|'{3}[\s\S]*?'{3})[ \t]*$", re.MULTILINE
+)
 _MOST_JOINED = 6  # maximum number of lines of a statement
 
 
@@ -121,9 +134,28 @@ class PythonReading(Reading):
         self.listing = False
         self.is_outside = False  # whether the last line was not part of a plan
         self.has_control = False  # whether the text has control flow that only CodeReading understands
-        for number, line in _statements(text):
+        for number, line in _statements(self.without_docstrings(text)):
             if not self.read(number, line):
                 break
+
+    def without_docstrings(self, text: str) -> str:
+        """Remove docstrings, which may contain example plans, if there are checks elsewhere; keep the line numbers."""
+
+        def blank(match: re.Match[str]) -> str:
+            return "\n" * match[0].count("\n")
+
+        code = _DOCSTRING.sub(blank, text)
+        if "check" not in code:
+            return text
+        for match in _DOCSTRING.finditer(text):
+            if "check" in match[0]:
+                self.note(1 + text.count("\n", 0, match.start()), "a docstring is left out")
+        return code
+
+    def note_control(self, number: int, text: str) -> None:
+        """Append a note on control flow that only :class:`CodeReading` understands."""
+        self.note(number, text)
+        self.has_control = True
 
     def read(self, number: int, line: str) -> bool:
         """Parse one line, and return whether the answer continues after it."""
@@ -194,11 +226,9 @@ class PythonReading(Reading):
         """Parse an ``if`` or ``else`` and a call on the same line."""
         condition, rest = (None, code[branch.end() :]) if branch[2] else self.condition(number, code, branch.end())
         if branch[2]:
-            self.note(number, "'else' has no condition; the skills under it are left out")
-            self.has_control = True
+            self.note_control(number, "'else' has no condition; the skills under it are left out")
         if branch[1] == "elif":
-            self.note(number, "'elif' is read as 'if', without the negation of the conditions above")
-            self.has_control = True
+            self.note_control(number, "'elif' is read as 'if', without the negation of the conditions above")
         if self.blocks and self.blocks[-1].body is None:
             self.blocks[-1].body = indent
         self.blocks.append(_Block(indent, number, condition))
@@ -225,31 +255,29 @@ class PythonReading(Reading):
         elif not rest.startswith((":", "#")):
             fault = fault or (f'expected only check("..."), got {shown(code)}' if rest else "")
         if fault:
-            self.note(number, fault)
-            self.has_control = True
+            self.note_control(number, fault)
         return (None if fault else " and ".join(conditions)), rest.lstrip(": ")
 
     def call(self, number: int, indent: int, code: str, call: re.Match[str]) -> None:
-        """Parse a call of a skill, and append the clause under the open conditions."""
+        """Parse the call of a skill, and append a clause that has the conditions of all open ``if`` blocks."""
         words, named, at = list[str](), dict[str, str](), call.end()
+        code = code[:at] + re.sub(r"\bnot\s+([\"'])(.*?)\1", r"\1not (\2)\1", code[at:])  # until=not "..."
         while match := _ARGUMENT.match(code, at):
             value = _unquoted(match[2]) if match[2] else match[3].strip()
             if match[1]:
                 named[match[1]] = value
+                if match[2] and call[1] != "move_gripper" and match[1] not in ("goal", "until"):
+                    words.append(f"{match[1]} {value}" if match[1] in PROGRAM_WORDS["prepositions"] else value)
             else:
                 words.append(value)
             at = match.end()
         if code[at : at + 1] != ")" and (at < len(code) or not (words or named)):
-            self.note(number, f"the call is cut off: {shown(code)}")
-            return
+            return self.note(number, f"the call is cut off: {shown(code)}")
         if not self.blocks:
-            self.note(number, f"a skill without a condition is left out: {shown(code)}")
-            self.has_control = True
-            return
+            return self.note_control(number, f"a skill without a condition is left out: {shown(code)}")
         block = self.blocks[-1]
         if self.section.clauses and self.section.clauses[-1].line == block.line:
-            self.note(number, "a second skill under the same condition becomes a separate step")
-            self.has_control = True
+            self.note_control(number, "a second skill under the same condition becomes a separate step")
         block.body = indent if block.body is None else block.body
         conditions = [above.condition for above in self.blocks if above.condition is not None]
         if len(conditions) < len(self.blocks):
@@ -298,5 +326,5 @@ def _statements(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _bare(code: str) -> str:
-    """Remove the strings and the comment from a line; an unterminated string leaves a quote."""
+    """Remove the strings and the comment from a line. Of an unterminated string, the quote remains."""
     return _LITERAL.sub(lambda literal: "" if literal[1] or literal[2] else '"', code).partition("#")[0]

@@ -1,28 +1,55 @@
-"""A reader of programs in JSON and YAML: behaviour trees, rules, state machines and nested choices, with any keys."""
+"""A reader of programs in JSON and YAML, by structure and content; the keys are only hints.
+
+A text that states something about the scene is a condition, and a text that begins with a verb is an action. An object
+with conditions and actions is a branch, and a list with branches is a choice.
+"""
 
 from __future__ import annotations
 
-import ast
 import json
 import re
-import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 from lw_torchrl._util.checks import shown
+from lw_torchrl.language.connectives import parse_words
 from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, as_expression, negate
-from lw_torchrl.language.formats.base import (
-    PROGRAM_WORDS,
-    Reading,
-    code_blocks,
-    command,
-    in_turn,
-    is_verb,
-    statement,
-    words_of,
+from lw_torchrl.language.formats.base import PROGRAM_WORDS, Reading, code_blocks, command, in_turn, statement, words_of
+from lw_torchrl.language.formats.phrases import (
+    ROLES,
+    STRUCTURE,
+    comparison_of,
+    is_bare,
+    is_command,
+    is_comparator,
+    is_noun,
+    is_predicate,
+    is_statement,
+    is_told,
+    join_phrase,
+    plain,
+    role_of,
+    truth_of,
 )
+from lw_torchrl.language.formats.sentences import SentenceReading
+from lw_torchrl.language.formats.shapes import (
+    MOST_VALUES,
+    RULE,
+    has_action,
+    mentions,
+    names_of,
+    states,
+    texts_in,
+    usual_shape,
+    values_in,
+)
+from lw_torchrl.language.formats.values import parse_value
+from lw_torchrl.language.polarity import instruction
 from lw_torchrl.language.programs import (
+    Action,
     Block,
     Branch,
     Check,
@@ -34,15 +61,16 @@ from lw_torchrl.language.programs import (
     actions_of,
     is_condition,
 )
+from lw_torchrl.language.queries import split_words
+from lw_torchrl.language.relations import PREDICATES
 
-_KEYS: Mapping[str, list[str]] = PROGRAM_WORDS["keys"]
-_KNOWN = {word for words in _KEYS.values() for word in words}
 _TYPES = {word: kind for kind, words in PROGRAM_WORDS["types"].items() for word in words}
-_MOST_VALUES = 20_000  # YAML's references can repeat a value
-_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|//[^\n]*|/\*.*?\*/|#[^\n]*|[^"\[\]{},/#]+|.', re.DOTALL)
-_YAML = re.compile(r"^\s*(?:- )?[\w -]{1,40}:(?:\s|$)", re.MULTILINE)
-_NUMBERED = re.compile(r"[a-z]+ \d+")
-_CODE = re.compile(r"^\s*(?:async )?(?:def|class) \w", re.MULTILINE)
+_JOINS = ("selector", "sequence", "not", "memory")
+_KINDS = (*_JOINS, "loop")
+_LABELS = ("name", "comment", "start", "type")
+_PROSE = re.compile(r"[.;?] +\w|, *(?:if|unless|otherwise)\b", re.IGNORECASE)
+_SENTENCE = re.compile(r"(?:if|when|unless|otherwise|while)\b.*[,:]", re.IGNORECASE)
+_AND_OR = re.compile(r"\s*(?:\band\b|\bor\b|\bnot\b|[()&|!]+)\s*", re.IGNORECASE)
 
 
 class TreeReading(Reading):
@@ -50,143 +78,81 @@ class TreeReading(Reading):
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        for start, block in code_blocks(text):
-            value = self.parse(block, start)
-            if not isinstance(value, dict | list):
-                continue
-            tree = _Tree(self, block, start, _definitions(value))
+        for start, block in _sections(text):
             try:
+                value = usual_shape(parse_value(block) if isinstance(block, str) else [*map(parse_value, block)])
+                block = text if isinstance(block, list) else block
+                texts = [text for key, text in texts_in(value) if role_of(key) not in ("name", "comment")]
+                if value is None or ("{" not in block and any(map(_PROSE.search, texts))):
+                    continue  # sentences with colons look like YAML
+                tree = _Tree(self, block, start, value)
                 node = tree.node(value)
+                if unused := [names for names in tree.tables if names.isdisjoint(tree.used)]:  # not definitions
+                    tree = _Tree(self, block, start, value, set[str]().union(*unused))
+                    node = tree.node(value)
+            except ImportError:
+                self.note(start + 1, "this may be YAML, which needs PyYAML to be read; run: pip install pyyaml")
+                continue
             except (RecursionError, ValueError):
                 self.error = "the tree is too large or nests too deeply"
                 continue
-            texts = [action.text.split() for action in actions_of(node)]
-            tree.note_lost(value, [" ".join(words) for words in texts])
-            # A list of texts in prose is not a plan.
-            is_listing = "{" not in str(value) and not _has_branch(node)
-            if (
-                node is not None
-                and texts
-                and not (is_listing and any(len(words) < 2 or not is_verb(words) for words in texts))
-            ):
+            texts = [action.text for action in actions_of(node)]
+            tree.note_lost(value, texts)
+            is_program = "{" in str(value) or _has_condition(node) or all(map(is_told, texts))  # not a list in prose
+            if node is not None and texts and is_program:
                 self.add_tree("", start + 1, node)
-
-    def parse(self, block: str, start: int) -> Any:
-        """Parse JSON or YAML; None if the text is neither."""
-        bracket = re.search(r"[{\[]", block)
-        before = block if bracket is None else block[: bracket.start()]
-        is_yaml = len(_YAML.findall(before)) > 1 and not _CODE.search(block)
-        value = None if is_yaml or bracket is None else _json(block[bracket.start() :])
-        if value is not None or len(_YAML.findall(block)) < 2 or _CODE.search(block):
-            return value
-        try:
-            return _yaml(block)
-        except ImportError:
-            self.note(start + 1, "this may be YAML, which needs PyYAML to be read; run: pip install pyyaml")
-            return None
-
-
-def _has_branch(node: Node | None) -> bool:
-    return isinstance(node, Branch) or any(map(_has_branch, getattr(node, "parts", ())))
-
-
-def _definitions(value: Any) -> dict[str, Any]:
-    """Return the programs and conditions that a text defines by name, such as {"subtrees": {"grasp": ...}}."""
-    found = dict[str, Any]()
-    stack = [value]
-    said = {text for _, text in _texts(value)}
-    for each in stack:  # grows
-        if isinstance(each, dict):
-            is_machine = _get(_normal(each), "transitions") is not None
-            for key, inner in each.items():
-                role = " ".join(words_of(str(key)))
-                is_table = isinstance(inner, dict) and inner and said.issuperset(inner)  # all its names are used
-                is_table = is_table and not is_machine and role not in _KEYS["states"] + _KEYS["transitions"]
-                if is_table or role in _KEYS["definitions"]:
-                    rows = inner if isinstance(inner, list) else []
-                    found |= (
-                        inner
-                        if isinstance(inner, dict)
-                        else {str(row["id"]): row for row in rows if isinstance(row, dict) and "id" in row}
-                    )
-            stack += each.values()
-        elif isinstance(each, list):
-            stack += each
-        if len(stack) > _MOST_VALUES:
-            break
-    return found
-
-
-def _texts(value: Any) -> Iterator[tuple[str, str]]:
-    """Yield each text in a value with its key."""
-    stack = [("", value)]
-    for key, each in stack:  # grows
-        if isinstance(each, str):
-            yield key, each.strip()
-        elif isinstance(each, dict | list) and len(stack) < _MOST_VALUES:
-            pairs = each.items() if isinstance(each, dict) else ((key, part) for part in each)
-            stack += [(str(name), part) for name, part in pairs]
-
-
-def _json(text: str) -> Any:
-    """Parse JSON, with comments, trailing commas and missing brackets; None if the text is not JSON."""
-    with suppress(ValueError, RecursionError):
-        return json.loads(text)
-    parts, closers = list[str](), list[str]()
-    for token in _TOKEN.findall(text):
-        if token[:2] in ("//", "/*") or token[0] == "#" or token.isspace():
-            continue
-        if token in ("]", "}"):
-            if not closers:
-                break
-            closers.pop()
-            while parts[-1] == ",":
-                parts.pop()
-        parts.append(token)
-        if token in ("[", "{"):
-            closers.append("]" if token == "[" else "}")
-        if not closers:
-            break
-    while closers and parts and not (parts[-1] in "]}[{" or (parts[-1][-1] == '"' and len(parts[-1]) > 1)):
-        parts.pop()  # of a value that is cut off
-    if len(parts) > 1 and closers and closers[-1] == "}" and parts[-1][-1] == '"' and parts[-2].strip() != ":":
-        parts.pop()  # a key without a value
-    while parts and parts[-1] == ",":
-        parts.pop()
-    repaired = "".join([*parts, *reversed(closers)])
-    with suppress(ValueError, RecursionError):
-        return json.loads(repaired)
-    with suppress(ValueError, TypeError, SyntaxError, RecursionError, MemoryError), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about invalid escapes in the text
-        return ast.literal_eval(repaired)
-    return None
-
-
-def _yaml(text: str) -> Any:
-    """Parse YAML without its types; None if the text is not YAML."""
-    import yaml  # type: ignore[import-untyped]
-
-    with suppress(yaml.YAMLError, ValueError, RecursionError):
-        return yaml.load(text, getattr(yaml, "CBaseLoader", yaml.BaseLoader))
-    return None
 
 
 class _Tree:
-    """The conversion of a JSON value to a program."""
+    """The conversion of a JSON value to a program. Conditions are programs of checks."""
 
-    def __init__(self, reading: Reading, text: str, start: int, definitions: Mapping[str, Any]) -> None:
+    def __init__(self, reading: Reading, text: str, start: int, value: Any, unused: Collection[str] = ()) -> None:
         self.reading, self.text, self.start, self.at, self.count = reading, text, start, 0, 0
-        self.definitions, self.opened = definitions, list[str]()  # opened: the definitions that are being read
-        self.conditions = set[str]()  # texts that were read as conditions
+        self.definitions, self.hidden, self.has_edges = dict[str, Any](), set[tuple[int, Any]](), False
+        self.subgoals = set[int]()
+        self.opened, self.conditions = list[str](), set[str]()  # definitions being read, texts read as conditions
+        self.used, self.tables = set[str](), list[set[str]]()
+        self.define(value, unused)
+
+    def define(self, value: Any, unused: Collection[str]) -> None:
+        """Find the programs and conditions that a text defines by name, which are read where they are named."""
+        tables = [each for _, each in values_in(value) if isinstance(each, dict | list)]
+        self.has_edges = any(map(_edges, tables))
+        counts, fields = _counts(value), Counter(texts_in(value))
+        for table in tables:
+            rows = [row for row in table if isinstance(row, dict)]
+            if len(rows) > 1 and all(any(map(_is_goal, row)) for row in rows):
+                self.subgoals |= {id(row) for row in rows if not any(_is_test(*pair) for pair in row.items())}
+            keys = [*table] if isinstance(table, dict) else [*range(len(table))]
+            names = [*map(str, keys)] if isinstance(table, dict) else names_of(table, counts, fields)
+            if self.has_edges and len({*names}) > 1 and _is_machine([table[key] for key in keys], {*names}):
+                continue
+            found = {
+                name: key
+                for name, key in zip(names, keys, strict=True)
+                if name not in unused and not _is_reserved(name, table[key])
+                if counts[name] > _counts([table[key]])[name]
+            }
+            inside = _counts(table) if len(found) > 1 else counts
+            is_table = any(counts[name] > inside[name] for name in found)  # named from outside
+            self.hidden |= {(id(table), key) for key in (keys if is_table else found.values())}
+            self.definitions |= {name: table[key] for name, key in found.items()}
+            self.tables += [{*found}] if found and has_action([table[key] for key in found.values()]) else []
 
     def note_lost(self, value: Any, actions: Collection[str]) -> None:
-        """Note each text that begins with a verb but is in no action or condition of the program."""
-        for key, text in _texts(value):
-            is_action = " ".join(words_of(key)) not in _KEYS["comment"] + _KEYS["name"] and len(text.split()) > 1
-            if is_action and is_verb(command(text).split()) and text not in self.conditions:
-                parts = [part.text for part in actions_of(in_turn(command(text), 1))]
-                if not all(any(part in action for action in actions) for part in parts):
-                    self.reading.note(self.line(text), f"{shown(text)} is left out: no step has it")
+        """Note each text that begins with a verb but was not parsed as part of any action or condition."""
+        kept = [{*plain(action).split()} for action in actions]
+        rows = [each for _, each in values_in(value) if isinstance(each, dict) and "verb" in map(str, each)]
+        phrases = [join_phrase(each, "act", self.definitions) for each in rows]
+        verbs = [("", phrase.text) for phrase in phrases if phrase and phrase.verb]  # {"verb": "lift", "object": "mug"}
+        for key, text in [*texts_in(value), *verbs]:
+            words = command(text.replace('"', ""))
+            is_state = text in self.conditions and is_predicate(re.split(r"[\s(]", text)[0])  # "open(gripper)"
+            if is_state or role_of(key) in ("name", "comment") or " " not in words or not is_command(text):
+                continue
+            parts = [{*plain(part.text).split()} for part in actions_of(in_turn(words, 1))]
+            if not all(any(part <= action for action in kept) for part in parts):
+                self.reading.note(self.line(text), f"{shown(text)} is left out: no step has it")
 
     def line(self, text: str) -> int:
         """Return the line of the next occurrence of a text."""
@@ -196,305 +162,479 @@ class _Tree:
         self.at = max(self.at, found)
         return self.start + 1 + self.text.count("\n", 0, self.at)
 
-    def node(self, value: Any, is_rule_list: bool = False) -> Node | None:
-        """Convert a value to a program, or return None if it has neither actions nor conditions."""
+    def node(self, value: Any, hint: str = "") -> Node | None:
+        """Convert a value to a program; None if it has neither actions nor conditions.
+
+        ``hint`` says what its texts are: "test" for conditions, "act" for actions, "" if only their content tells.
+        """
         self.count += 1
-        if self.count > _MOST_VALUES:
+        if self.count > MOST_VALUES:
             raise ValueError("too many values")
-        if isinstance(value, str):
-            return self.leaf(value.strip())
-        if isinstance(value, list):
-            if value and isinstance(value[0], str) and (kind := _TYPES.get(value[0].lower())):  # ["sequence", ...]
-                rest = value[1] if kind in ("condition", "action") and len(value) == 2 else value[1:]
-                return self.object({"type": kind, "text" if isinstance(rest, str) else "children": rest})
-            pairs = [each for each in value if isinstance(each, list) and len(each) == 2]
-            if pairs == value and all(isinstance(test, str) and is_verb(str(then).split()) for test, then in pairs):
-                value = [{"if": test, "then": then} for test, then in pairs]
-            nodes = self.children(value)
-            rules = is_rule_list or any(isinstance(each, Branch) for each in nodes)
-            return None if not nodes else Selector(tuple(nodes)) if rules else Sequence(tuple(nodes))
-        return self.object(_normal(value)) if isinstance(value, dict) else None
-
-    def leaf(self, text: str) -> Node | None:
-        """Convert a text to an action, a condition that ends with "?", or the program that it names."""
-        if text in self.definitions and text not in self.opened:
-            self.opened.append(text)
-            node = self.node(self.definitions[text])
-            self.opened.pop()
-            return node
-        if text.endswith("?"):
-            return Check(self.condition(text))
-        words = command(text)
-        return in_turn(words, self.line(text)) if words else None
-
-    def object(self, row: dict[str, Any]) -> Node | None:
-        row = {
-            key: each
-            for key, each in row.items()
-            if not (key in _KEYS["otherwise"] and _is_true(each))  # {"else": true, "do": ...}
-            and not (isinstance(each, dict) and key not in _KEYS["states"] and each.keys() <= self.definitions.keys())
-        }
-        kind = _TYPES.get(" ".join(words_of(str(_get(row, "type", "")))))
-        memory = kind == "memory" or _is_true(_get(row, "memory"))
-        kind = "sequence" if kind == "memory" else kind
-        condition, then = self.tests(row), _get(row, "action")
-        children = _get(row, "children")
-        if isinstance(root := row.get("root"), str) and root in self.definitions:
-            return self.leaf(root)
-        if (reference := _get(row, "reference")) is not None and str(reference) in self.definitions:
-            node = self.leaf(str(reference))
-            return node if condition is None or node is None else Branch(condition, node)
-        states, exits = _get(row, "states"), _get(row, "transitions")
-        if states is None and isinstance(then, dict) and exits is not None:  # a table of actions, and one of exits
-            by_state = exits if isinstance(exits, dict) else {}
-            for each in exits if isinstance(exits, list) else []:
-                by_state.setdefault(str(each.get("from")) if isinstance(each, dict) else "", []).append(each)
-            states = {name: {"action": each, "transitions": by_state.get(name, [])} for name, each in then.items()}
-        if states is not None:
-            return self.object(_normal(states)) if "states" in _normal(states) else self.machine(states, row)
-        if kind in ("selector", "sequence", "not") and children is not None:
-            parts = tuple(self.children(children))
-            if kind == "not" and all(map(is_condition, parts)):
-                return Check(negate(all_of(part.condition for part in parts if isinstance(part, Check))))
-            return Selector(parts) if kind == "selector" else Sequence(parts, memory)
-        if kind == "condition":
-            return Check(self.condition(row))
-        if any(_NUMBERED.fullmatch(key) and key.split(" ")[0] in _TYPES for key in row):
-            return Sequence(tuple(self.typed(row)))
-        if kind == "action" or (kind is None and condition is None and isinstance(then, str)):
-            return self.until(self.action(row), row)
-        for role in ("rules", "sequence", "remembered"):
-            if isinstance(rules := _get(row, role), list | dict):
-                parts = tuple(self.children(rules))
-                last = None if (other := _get(row, "otherwise")) is rules else self.node(other)
-                parts = parts if last is None else (*parts, last)
-                if role == "rules" or last is not None:
-                    return Selector(parts)
-                if memory or role == "remembered":
-                    return Sequence(parts, memory=True)
-                if (
-                    parts and isinstance(parts[-1], Branch) and parts[-1].condition == TRUE
-                ):  # the last rule is the default
-                    return Selector(parts)
-                return (Block if any(isinstance(part, Branch) for part in parts) else Sequence)(parts)
-        if condition is not None:
-            test = negate(condition) if _is_true(_get(row, "negate")) else condition
-            body = self.node(children if then is None else then)
-            otherwise = self.node(_get(row, "otherwise"))
-            if (
-                "if" in row and (then_elif := row.get("then elif")) is not None
-            ):  # "elif" and "then_elif" of the same object
-                otherwise = Branch(self.condition(row.get("elif")), self.node(then_elif) or Sequence(), otherwise)
-            if body is None and otherwise is None:
-                return Check(test)
-            if "while" in row or kind == "loop":
-                return Loop(test, body or Sequence())
-            return Branch(test, self.until(body or Sequence(), row), otherwise)
-        if any(_get(row, role) is not None for role in ("all", "any", "not")):
-            return Check(self.condition(row))
-        if then is not None or children is not None:
-            body = self.node(children if then is None else then)
-            return None if body is None else self.until(body, row)
-        if (otherwise := _get(row, "otherwise")) is not None:
-            return self.node(otherwise)
-        if typed := self.typed(row):
-            return typed[0] if len(typed) == 1 else Sequence(tuple(typed))
-        values = [each for each in row.values() if isinstance(each, dict | list)]
-        if len(values) == 1 or (values and all(key.isdigit() for key in row)):  # a name or numbers, with programs
-            return self.node(values[0] if len(values) == 1 else values)
-        if any(isinstance(each, str) for key, each in row.items() if key not in _KEYS["comment"] + _KEYS["name"]):
-            self.reading.note(
-                self.line(next(each for each in row.values() if isinstance(each, str))),
-                f"{shown(json.dumps(row))} is left out: it has no action and no condition",
-            )
-        return None
-
-    def tests(self, row: Mapping[str, Any]) -> Expression | None:
-        """Return the condition of the keys "if", "unless" and the like; None without any."""
-        tests = [] if (condition := _get(row, "condition")) is None else [self.condition(condition)]
-        tests += [negate(self.condition(row["unless"]))] if "unless" in row else []
-        if _get(row, "action") is not None:  # {"any": [...], "do": ...}
-            joins = {role: row[role] for role in ("all", "any", "not") if isinstance(row.get(role), list | dict)}
-            tests += [self.condition(joins)] if joins else []
-        return all_of(tests) if tests else None
-
-    def typed(self, row: Mapping[str, Any]) -> list[Node]:
-        """Return the parts of an object whose keys begin with a type: {"condition 1": ..., "sequence push": ...}."""
-        parts = list[Node]()
-        kinds = [(key.split(" ")[0].rstrip("0123456789"), each) for key, each in row.items()]
-        if sum(word in _TYPES for word, _ in kinds) < 2 and not any(map(_NUMBERED.fullmatch, row)):
-            return []
-        for word, each in kinds:
-            kind = _TYPES.get(word)
-            if kind == "condition":
-                parts.append(Check(self.condition(each)))
-            elif kind in ("selector", "sequence"):
-                parts.append((Selector if kind == "selector" else Sequence)(tuple(self.children(each))))
-            elif kind is not None and (node := self.node(each)) is not None:
-                parts.append(node)
-        return parts
-
-    def children(self, value: Any) -> list[Node]:
-        if isinstance(value, dict):
-            row = _normal(value)
-            nested = _get(row, "children")
-            return self.typed(row) or self.children([value] if nested is None else nested)
-        values = value if isinstance(value, list) else [value]
-        nodes = list[Node]()
-        for number, each in enumerate(values):
-            # In a sequence of texts, those that do not begin with a verb are conditions.
-            is_test = isinstance(each, str) and number + 1 < len(values) and each not in self.definitions
-            if is_test and not is_verb(command(each).split()):
-                nodes.append(Check(self.condition(each)))
-            elif (node := self.node(each)) is not None:
-                nodes.append(node)
-        return nodes
-
-    def until(self, node: Node, row: Mapping[str, Any]) -> Node:
-        """Run a program until the condition of the key "until", if there is one."""
-        until = _get(row, "until")
-        return node if until is None else Loop(negate(self.condition(until)), node)
-
-    def action(self, row: dict[str, Any]) -> Node:
-        """Join the texts of an action, such as {"verb": "lower", "object": "the puck", "to": "the table"}."""
-        key = next((each for each in (*_KEYS["action"], *_KEYS["text"]) if isinstance(row.get(each), str)), "")
-        line = self.line(row.get(key, ""))
-        words = [command(row.pop(key, ""))]
-        explained = " ".join(words_of(str(row.get("description", "")))).split(" ")
-        if (
-            explained[0] == words[0].replace("_", " ").split(" ")[0]
-        ):  # {"skill": "push", "description": "push the door"}
-            return in_turn(str(row["description"]), line)
-        if isinstance(arguments := row.pop("args", None), list):
-            words += [str(each) for each in arguments]
-        for name, value in row.items():
-            if isinstance(value, str) and not any(name in _KEYS[role] for role in ("comment", "type", "name", "until")):
-                words.append(f"{name} {value}" if name in PROGRAM_WORDS["prepositions"] else value)
-        return in_turn(" ".join(words), line)
+        if isinstance(value, bool):
+            return Check(TRUE if value else FALSE) if hint == "test" else None
+        if isinstance(value, list | dict):
+            return self.listed(value, hint) if isinstance(value, list) else self.object(value, hint)
+        is_text = isinstance(value, str) or str(value) in self.definitions
+        return self.leaf(str(value).strip(" \n${}"), hint) if is_text else None
 
     def condition(self, value: Any) -> Expression:
-        """Convert a value to a condition."""
-        self.count += 1
-        if isinstance(value, list):
-            return all_of(map(self.condition, value))
-        if isinstance(value, bool):
-            return TRUE if value else FALSE
-        if not isinstance(value, dict):
-            return self.said(str(value).strip())
-        row = _normal(value)
-        joins = " ".join(words_of(str(_get(row, "type", ""))))
-        kind = _TYPES.get(joins)
-        parts = list[Expression]()
-        for role, join in (("all", all_of), ("any", any_of), ("not", any_of)):
-            if (operands := _get(row, role)) is not None:
-                part = join(map(self.condition, operands if isinstance(operands, list) else [operands]))
-                parts.append(negate(part) if role == "not" else part)
-        relation = next((key for key in _KEYS["relation"] if isinstance(row.get(key), str)), "")
-        inner = next(
-            (row[key] for key in (*_KEYS["condition"], *_KEYS["children"], *_KEYS["operands"]) if key in row), None
-        )
-        if relation:
-            operands = row.get("args") or [_get(row, "subject", ""), _get(row, "object", "")]
-            first, *others = [str(each) for each in operands] if isinstance(operands, list) else [str(operands)]
-            part = self.said(" ".join([first, " ".join(words_of(row[relation])), *others]).strip())
-            parts.append(negate(part) if relation.endswith("not") else part)
-        elif not parts and inner is not None:
-            join = any_of if kind == "selector" or joins in _KEYS["any"] or joins in _KEYS["not"] else all_of
-            part = join(map(self.condition, inner if isinstance(inner, list) else [inner]))
-            parts = [negate(part) if kind == "not" or joins in _KEYS["not"] else part]
-        if not parts and joins not in PROGRAM_WORDS["always"]:
-            skipped = (*_KEYS["comment"], *_KEYS["type"], *_KEYS["negate"])
-            texts = [each for key, each in row.items() if isinstance(each, str) and key not in skipped]
-            named = [each for key, each in row.items() if key in _KEYS["name"] and each in texts]
-            texts = [each for each in texts if each not in named] or texts
-            parts = [self.said(" ".join(texts))] if texts else []
-        result = all_of(parts)
-        return negate(result) if _is_true(_get(row, "negate")) else result
+        """Convert a value to a condition; an empty value becomes a condition that is always true."""
+        return TRUE if value in ([], {}, "") else _condition(self.node(value, "test"))
+
+    def leaf(self, text: str, hint: str) -> Node | None:
+        """Convert a text to an action, a condition, or the program that it names."""
+        if self.is_defined(text):
+            self.opened.append(text)
+            self.used.add(text)
+            node = self.node(self.definitions[text], hint)
+            self.opened.pop()
+            return node
+        if (_is_always(text) and hint != "act") or (hint == "test" and truth_of(text) is not None):
+            return Check(FALSE if truth_of(text) is False else TRUE)
+        if hint != "test" and text[:1] == "!" and "(" not in text and is_command(text[1:]):  # marks an action
+            return self.leaf(text[1:].strip(), "act")
+        if rule := RULE.fullmatch(text):
+            return self.object({"if": rule[1] or rule[4], "then": rule[2] or rule[5], "else": rule[3] or ""}, "")
+        if (otherwise := re.match(r"(?:else|otherwise)[,:]? +(?!if\b)", text, re.IGNORECASE)) and hint != "test":
+            return self.leaf(text[otherwise.end() :], "act")
+        if hint != "act" and _SENTENCE.match(text) and any(actions_of(tree := SentenceReading(text).section.tree)):
+            return tree
+        if hint == "test" or (is_statement(text) if hint == "" else text.endswith("?")):
+            return Check(self.said(text))
+        if call := re.fullmatch(r"(?:\w+\.)?([A-Za-z]\w*)\((.*)\)", text):
+            arguments = [each.strip(" '\"").partition("=") for each in call[2].split(",") if each.strip()]
+            named = {key.strip(): each.strip(" '\"") for key, sign, each in arguments if sign}
+            unnamed = [each for each, sign, _ in arguments if not sign]
+            value = {"call": call[1], "of": unnamed, **named} if named else [call[1], *unnamed]
+            if (phrase := self.phrase(value, hint)) is not None:
+                return phrase
+            text = f"{call[1]}({call[2]})"
+        words = command(text) if " " in text or "(" in text else " ".join(words_of(text))
+        words = words.lower() if words.split(" ")[0].isupper() else words
+        return in_turn(words, self.line(text)) if words and (hint == "act" or is_told(text)) else None
 
     def said(self, text: str) -> Expression:
         """Convert a text to a condition; a name that the text defines stands for its definition."""
         self.conditions.add(text)
-        if text in self.definitions and text not in self.opened:
-            self.opened.append(text)
-            condition = self.condition(self.definitions[text])
-            self.opened.pop()
-            return condition
-        return TRUE if text.lower() in PROGRAM_WORDS["always"] else as_expression(statement(text))
+        if self.is_defined(text):
+            return _condition(self.leaf(text, "test"))
+        words = split_words(statement(text))
+        if _is_always(text):
+            return TRUE
+        if not {*words} & self.definitions.keys() - {*self.opened}:
+            return as_expression(statement(text))
 
-    def machine(self, states: Any, row: Mapping[str, Any]) -> Node | None:
+        def operand(words: list[str]) -> Expression:
+            if words[0].lower() == "not" and len(words) == 2:
+                return negate(operand(words[1:]))
+            return self.said(" ".join(words)) if words[0] in self.definitions else as_expression(" ".join(words))
+
+        return parse_words(words, operand, lambda number, expected: ValueError(expected)) or TRUE
+
+    def phrase(self, value: Any, hint: str) -> Node | None:
+        """Join a value whose texts are names of objects, relations and verbs, such as {"near": ["gripper", "mug"]}."""
+        parts = list[dict[Any, Any]]()
+        if isinstance(value, dict) and hint != "act":
+            for key, inner in value.items():  # {"gripper": {"near": "mug", "is": "open"}, "above": ["mug", "table"]}
+                is_table = isinstance(inner, dict) and is_noun(str(key))
+                is_fact = is_predicate(str(key)) and isinstance(inner, list)
+                is_fact |= is_noun(str(key)) and isinstance(inner, str) and is_predicate(inner)
+                parts += [{key: {name: each}} for name, each in inner.items()] if is_table else [{key: inner}] * is_fact
+            if len(parts) > 1 and len(parts) >= len(value):
+                nodes = [self.phrase(part, hint) for part in parts]
+                return _joined([node for node in nodes if node is not None], "")
+        if (phrase := join_phrase(value, hint, self.definitions)) is None:
+            return None
+        if phrase.verb:
+            return in_turn(phrase.text, self.line(phrase.verb))
+        return Check(negate(as_expression(phrase.text)) if phrase.is_negated else as_expression(phrase.text))
+
+    def listed(self, value: list[Any], hint: str, kind: str = "") -> Node | None:
+        """Convert a list: conditions are joined, branches are alternatives, and other programs run in turn."""
+        first = value[0] if len(value) > 1 and isinstance(value[0], str) and not kind and not is_told(value[0]) else ""
+        role = (_TYPES.get(plain(first)) or role_of(first)) if first and first not in self.definitions else ""
+        if role == "test" and len(value) > 2:  # ["if", condition, program, program]
+            return self.object(dict(zip(("if", "then", "else"), value[1:], strict=False)), "")
+        if role in _JOINS:
+            return self.object({first: value[1:]}, hint)
+        if role in ("test", "condition", "act", "action", "else"):
+            inner = value[1] if len(value) == 2 else value[1:]
+            return self.node(inner, "test" if role in ("test", "condition") else "act")
+        if first and (phrase := self.phrase(value, hint)) is not None:
+            return phrase
+        nodes = list[Node]()
+        for number, each in enumerate(value):
+            is_text = self.is_unknown(each)
+            is_test = is_text and kind == "sequence" and number + 1 < len(value)
+            inner = "test" if is_test or hint == "test" else "act" if is_text and (kind or hint == "act") else ""
+            if (id(value), number) not in self.hidden and (node := self.node(each, inner)) is not None:
+                nodes.append(node)
+        return _joined(nodes, kind)
+
+    def object(self, row: dict[Any, Any], hint: str) -> Node | None:
+        """Convert an object: its type and flags are read here, its other fields by :meth:`branch`."""
+        flags = {plain(str(key)): truth_of(value) for key, value in row.items()}
+        if True in (flags.get("disabled"), flags.get("skip")) or flags.get("enabled") is False:
+            self.reading.note(self.line(str(next(iter(row)))), "a disabled part is left out")
+            return None
+        if self.has_edges and (machine := self.machine(row)) is not None:
+            return machine
+        if hint != "act" and (comparison := comparison_of(row)):
+            return Check(negate(self.said(comparison[0])) if comparison[1] else self.said(comparison[0]))
+        kind, memory, negated, fields = "", False, False, dict[str, Any]()
+        is_flat = not any(isinstance(each, dict | list) for each in row.values())
+        is_decorator = plain(str(row.get("type"))) == "decorator"  # {"type": "decorator", "name": "not"}
+        for place, (name, value) in enumerate(row.items()):
+            key, role, truth = str(name), role_of(str(name)), truth_of(value)
+            text = plain(value.split(".")[-1]) if isinstance(value, str) else ""
+            texts = value if isinstance(value, list) else [value]
+            is_command_alone = role != "else" and all(isinstance(each, str) and is_command(each) for each in texts)
+            if is_command_alone and not instruction(plain(key)).text:
+                self.reading.note(self.line(key), f"{shown(value)} is left out: {shown(key)} forbids it")
+                continue  # {"never": "close the gripper"}
+            if place and plain(key) in ("elif", "else if", "elseif"):
+                rest = dict([*row.items()][place + 1 :])
+                is_chain = isinstance(value, list) and any(map(has_action, value))
+                fields["else"] = [*value, *rest.values()] if is_chain else {"if": value, **rest}
+                break
+            if role in ("not", "truth") and truth is not None:
+                negated ^= truth == (role == "not")
+            elif (id(row), name) in self.hidden or _is_skipped(row, key, value):
+                continue
+            elif id(row) in self.subgoals and _is_goal(name) and states(value):
+                fields["until"] = value
+            elif role == "memory" and not isinstance(value, dict | list):
+                memory = bool(truth)
+            elif role == "type" and is_comparator(value) and is_flat:
+                fields[key] = value  # {"op": ">", "value": 0.05, ...}
+            elif ROLES.get(text) in _KINDS and role not in ("comment", "act") and (role != "name" or is_decorator):
+                kind = kind or ROLES[text]
+            elif role == "type" and isinstance(value, str) and re.search(r"\w[ (]", value) and is_command(value):
+                fields["do"] = value  # {"control": "move_to(gripper, mug)"}
+            elif role == "type" and text in PROGRAM_WORDS["always"]:
+                return Check(TRUE)
+            elif role == "type" and text and not is_told(value) and (text in _TYPES or not is_bare(text)):
+                kind = kind or _TYPES.get(text) or _TYPES.get(text.split()[-1], "")
+                if is_predicate(text) or is_comparator(value):
+                    fields[key] = value  # {"op": "near", ...}
+            elif isinstance(value, dict) and role in ("", "selector") and _is_answer(value) and not is_statement(key):
+                fields |= {str(inner): each for inner, each in value.items()}  # {"switch": ..., "cases": {"true": ...}}
+            else:
+                fields[key] = value
+        if kind in ("action", "condition"):
+            hint, kind = "act" if kind == "action" else hint if has_action(row) else "test", ""
+        node = self.branch(fields, hint, kind)
+        if node is None:
+            labels = {key: each for key, each in fields.items() if isinstance(each, str) and role_of(key) in _LABELS}
+            texts = [each for each in labels.values() if is_told(each) or self.is_defined(each)]
+            texts += [each for key, each in labels.items() if hint and role_of(key) == "name"]
+            node = self.node(texts[0], hint) if texts else None
+        if isinstance(node, Sequence) and (memory or kind == "memory"):
+            node = Sequence(node.parts, memory=True)
+        if negated and isinstance(node, Branch | Loop):
+            return replace(node, condition=negate(node.condition))
+        if node is not None and negated != (kind == "not") and is_condition(node):
+            return Check(negate(_condition(node)))
+        return node
+
+    def branch(self, fields: dict[str, Any], hint: str, kind: str) -> Node | None:
+        """Convert a JSON object to a program in which the object's conditions guard its actions."""
+        tests, bodies, otherwise, until = list[Expression](), list[Node](), list[Node](), None
+        join = kind if kind in _JOINS else ""
+        labels = [value for key, value in fields.items() if role_of(key) == "name" and isinstance(value, str)]
+        if any(map(is_told, labels)):  # {"shape": "box", "label": "close the gripper"}
+            fields = {key: value for key, value in fields.items() if role_of(key) or not self.is_unknown(value)}
+        free = {key: value for key, value in fields.items() if role_of(key) not in STRUCTURE[:5]}
+        has_act = any(role_of(key) == "act" for key in free)
+        if has_act:
+            free = {key: value for key, value in free.items() if role_of(key) or not value or not _is_facts(value)}
+        is_whole = hint != "test" or len(free) == len(fields)
+        if not join and is_whole and (node := self.phrase(free, hint or ("act" if has_act else ""))) is not None:
+            fields = {key: value for key, value in fields.items() if key not in free}
+            if is_condition(node):
+                tests.append(_condition(node))
+            else:
+                bodies.append(node)
+        fields = {key: value for key, value in fields.items() if role_of(key) not in _LABELS or _is_program(key, value)}
+        if any(isinstance(value, dict | list) and has_action(value) for value in fields.values()):
+            has_test = any(role_of(key) in STRUCTURE[:4] for key in fields)
+            texts = {key: value for key, value in fields.items() if role_of(key) == "" and isinstance(value, str)}
+            titles = {key for key, value in texts.items() if is_command(value) or (has_test and " " not in value)}
+            fields = {key: value for key, value in fields.items() if key not in titles}
+        ways = [key for key, value in fields.items() if role_of(key) == "" and has_action(value)]
+        if len(fields) == 3 and len(ways) == 2 and not join and not tests:  # {"split": ..., "left": ..., "right": ...}
+            test = next(value for key, value in fields.items() if key not in ways)
+            if states(test) and not has_action(test):
+                fields = {"if": test, "then": fields[ways[0]], "else": fields[ways[1]]}
+        if join and [role_of(key) for key in fields] == ["test"]:  # {"type": "or", "conditions": [...]}
+            value = next(iter(fields.values()))
+            return self.listed(value if isinstance(value, list) else [value], "test", join)
+        inner = hint if hint == "test" or len(fields) == 1 else ""
+        for key, value in fields.items():
+            role = role_of(key)
+            if role == "unless" or (role in ("test", "loop") and not has_action(value)):
+                test = self.condition(value)
+                tests.append(negate(test) if role == "unless" else test)
+            elif role == "until" and (isinstance(value, str) or not has_action(value)):
+                until = self.condition(value)
+                until = None if until in (TRUE, FALSE) else until
+            elif role == "else" or (plain(key) == "fallback" and isinstance(value, str)):
+                node = self.node(value, "act")
+                otherwise += [] if node is None else [node]
+            elif (node := self.field(key, value, role, inner, join)) is not None:
+                if join or not is_condition(node):
+                    bodies.append(node)
+                else:
+                    tests.append(_condition(node))
+        if join and not bodies:
+            bodies, tests = [Check(test) for test in tests], []
+        body = _joined(bodies, join or ("" if any(map(_is_guarded, bodies)) else "sequence"))
+        if until is not None and tests:
+            tests.append(negate(until))
+        elif until is not None and body is not None:
+            body = Loop(negate(until), body)
+        last = _joined(otherwise, "selector")
+        if not tests:
+            return last if body is None else body if last is None else Selector((body, last))
+        if body is None and last is None:
+            return Check(all_of(tests))
+        is_loop = kind == "loop" or any(role_of(key) == "loop" for key in fields)
+        return Loop(all_of(tests), body or Sequence()) if is_loop else Branch(all_of(tests), body or Sequence(), last)
+
+    def is_defined(self, text: str) -> bool:
+        return text in self.definitions and text not in self.opened
+
+    def is_unknown(self, value: Any) -> bool:
+        """Return whether a value is a text without any meaning for the plan."""
+        return isinstance(value, str) and not is_told(value) and value not in self.definitions
+
+    def field(self, key: str, value: Any, role: str, hint: str, join: str) -> Node | None:
+        """Convert a field that is not a condition by its key."""
+        if plain(key) == "nand":
+            return self.object({"not": {"all": value}}, hint)
+        if role in ("", "test") and is_statement(key):
+            if (truth := truth_of(value)) is not None:
+                return Check(self.said(key) if truth else negate(self.said(key)))
+            if str(value).lower() in ("*", "-", "any", ""):  # of a decision table
+                return None
+            return self.object({"if": key, **(value if isinstance(value, dict) else {"then": value})}, "")
+        is_deed = role == "" and is_command(key) and (value is None or isinstance(value, dict | list))
+        if is_deed and not has_action(value):  # {"grasp": {"preconditions": [...]}}
+            action = self.leaf(key, "act") or Sequence()
+            return Branch(self.condition(value), action) if value else action
+        if role in _JOINS:
+            if self.is_unknown(value):
+                return None  # {"select": "first_valid"}
+            is_children = isinstance(value, dict) and role != "not"
+            children = value if is_children else {"children": value if isinstance(value, list) else [value]}
+            return self.object({"type": role, **children}, hint)
+        if role == "" and _is_facts({key: value}):
+            return self.phrase({key: value}, "test")
+        if join and isinstance(value, list) and role != "act":
+            return self.listed(value, hint, join)
+        return self.node(value, "act" if role == "act" else hint)
+
+    def machine(self, row: dict[Any, Any]) -> Node | None:
         """Convert a state machine to a selector: a later state is active once a condition that leads to it is true, and
         while no condition that leads back is. A plan has no memory, so the state that was active before is unknown.
         """
-        rows = (
-            [{"name": name, **_normal(each)} for name, each in states.items() if isinstance(each, dict)]
-            if isinstance(states, dict)
-            else [_normal(each) for each in states if isinstance(each, dict)]
-        )
-        if not any(_get(each, role) is not None for each in rows for role in ("transitions", "until")):
-            return Selector(tuple(node for each in rows if (node := self.object(each)) is not None))  # guarded states
-        named = {str(_get(each, "name")): each for each in rows}
-        nodes = {name: self.state(each) for name, each in named.items()}
-        exits = {name: self.exits(each, nodes[name]) for name, each in named.items()}
-        order = [str(_get(row, "start", next(iter(named), "")))]
+        tables = {str(key): value for key, value in row.items() if isinstance(value, dict | list)}
+        outside = [*_edges(tables).values()]
+        for table in [*tables.values(), row]:
+            pairs = table.items() if isinstance(table, dict) else [(_named(each), each) for each in table]
+            states = {str(name): each for name, each in pairs}
+            edges = [value for value in outside if value is not table]
+            is_led = any(text in states for _, text in texts_in(edges))
+            if len(states) > 1 and (is_led or _is_machine([*states.values()], {*states})):
+                break
+        else:
+            return None
+        nodes, exits = dict[str, Node | None](), dict[str, list[tuple[Expression, str]]]()
+        for name, each in states.items():
+            fields = {str(key): value for key, value in (each if isinstance(each, dict) else {"do": each}).items()}
+            led = {key for key, value in fields.items() if mentions(value, states) and role_of(key) != "name"}
+            until = [self.condition(value) for key, value in fields.items() if role_of(key) == "until"]
+            skipped = led | {key for key in fields if role_of(key) in ("until", "transitions", "name", "comment")}
+            nodes[name] = self.object({key: value for key, value in fields.items() if key not in skipped}, "")
+            leading: list[Any] = [{key: value} for key, value in fields.items() if key in led]
+            for rows in edges:
+                leading.append(rows.get(name) if isinstance(rows, dict) else [x for x in rows if _source(x) == name])
+            done = all_of(until or [Done(action.text) for action in actions_of(nodes[name])])
+            exits[name] = [pair for each in leading for pair in self.exits(each, states, done)]
+        start = next((str(value) for key, value in row.items() if role_of(str(key)) == "start"), "")
+        order = [start if start in states else next(iter(states))]
         for name in order:  # grows
-            order += [target for _, target in exits.get(name, ()) if target in named and target not in order]
-        order += [name for name in named if name not in order]
+            order += dict.fromkeys(target for _, target in exits[name] if target not in order)
+        order += [name for name in states if name not in order]
         parts = list[Node]()
         for place, name in reversed([*enumerate(order)]):
-            if (node := nodes.get(name)) is None:
+            if (node := nodes[name]) is None:
                 continue
-            enters = [test for source in order[:place] for test, target in exits.get(source, ()) if target == name]
+            enters = [test for source in order[:place] for test, target in exits[source] if target == name]
             back = [test for test, target in exits[name] if target in order[:place]]
             guard = all_of([any_of(enters), negate(any_of(back))]) if place else TRUE
             parts.append(node if guard == TRUE else Branch(guard, node))
         return Selector(tuple(parts)) if parts else None
 
-    def state(self, row: Mapping[str, Any]) -> Node | None:
-        return self.node(_get(row, "action"))
-
-    def exits(self, row: Mapping[str, Any], node: Node | None) -> list[tuple[Expression, str]]:
+    def exits(self, value: Any, states: Collection[str], test: Expression) -> list[tuple[Expression, str]]:
         """Return the (condition, name of the next state) pairs of a state."""
-        done = all_of(Done(each.text) for each in actions_of(node))
-        listed = _get(row, "transitions")
-        if isinstance(listed, str):
-            until = _get(row, "until")
-            return [(done if until is None else self.condition(until), listed)]
-        if isinstance(listed, dict):
-            normal = _normal(listed)
-            if _get(normal, "condition") is None:
-                return [(self.condition(test), str(name)) for name, test in listed.items()]
-            listed = [listed]
+        if isinstance(value, str):
+            return [(test, value)] if value in states else []
+        parts = [*value.items()] if isinstance(value, dict) else []
+        parts += [("", each) for each in value] if isinstance(value, list) else []
+        parts = [(str(key), each) for key, each in parts if str(key) not in ("from", "source")]
+        if isinstance(value, list) and len(value) == 3 and mentions(value[0], states):
+            parts = parts[1:]  # [state, condition, next state]
+        named = [each for key, each in parts if isinstance(each, str) and each in states and role_of(key) != "name"]
+        others = [each for _, each in parts if isinstance(each, str | dict | list) and each not in named]
+        if len(named) == 1 and others and not any(mentions(each, states) for each in others):
+            return [(all_of(map(self.condition, others)), named[0])]
         pairs = list[tuple[Expression, str]]()
-        for each in listed if isinstance(listed, list) else []:
-            is_pair = isinstance(each, list) and len(each) == 2  # [condition, name]
-            exit_row = (
-                _normal(each)
-                if isinstance(each, dict)
-                else dict(zip(("if", "to"), each, strict=True))
-                if is_pair
-                else {"to": each}
-            )
-            test = _get(exit_row, "condition")
-            pairs.append((done if test is None else self.condition(test), str(_get(exit_row, "target"))))
+        for key, each in parts:
+            if key in states:
+                pairs.append((self.condition(each), key))
+            else:
+                pairs += self.exits(each, states, self.said(key) if is_told(key) else test)
         return pairs
 
 
-def _normal(value: Any) -> dict[str, Any]:
-    """Return an object with its keys as lower-case words; an unknown key such as "entry action" is its last word."""
-    row = {" ".join(words_of(str(key))): each for key, each in value.items()} if isinstance(value, dict) else {}
-    unknown = {key for key in row if key not in _KNOWN and key not in PROGRAM_WORDS["always"]}
-    short = {key: key.split(" ")[-1] for key in unknown if key.count(" ") == 1 and key.split(" ")[0] not in _TYPES}
-    result = dict[str, Any]()
-    for key, each in row.items():
-        last = short.get(key, key)
-        result[last if last in _KNOWN and last not in row.keys() | result.keys() else key] = each
-    return result
+def _sections(text: str) -> list[tuple[int, str | list[str]]]:
+    """Return the (line, text) pairs of a text's values; values that refer to names of another one are a single list."""
+    blocks = [*code_blocks(text)]
+    found = list[Any]()
+    with suppress(ImportError, ValueError, RecursionError):
+        found = [parse_value(block) for _, block in blocks] if len(blocks) > 1 else []
+    names = [{str(key) for key in value} if isinstance(value, dict) else set[str]() for value in found]
+    for number, value in enumerate(found):
+        said = {text for _, text in texts_in(value)}
+        if any(len(said & each) > 1 for other, each in enumerate(names) if other != number):
+            return [(0, [block for (_, block), value in zip(blocks, found, strict=True) if value is not None])]
+    return [*blocks]
 
 
-def _get(row: Mapping[str, Any], role: str, default: Any = None) -> Any:
-    """Return the value of the first key that plays a role, such as "condition"."""
-    return next((row[key] for key in _KEYS[role] if key in row and row[key] not in ("", None)), default)
+def _edges(value: Any) -> dict[Any, Any]:
+    """Return the fields of an object that hold transitions between states."""
+    rows = value.items() if isinstance(value, dict) else ()
+    return {key: each for key, each in rows if role_of(str(key)) == "transitions"}
 
 
-def _is_true(value: Any) -> bool:
-    return str(value).lower() in ("true", "yes")
+def _is_facts(value: Any) -> bool:
+    """Return whether an object states facts: {"near": ["gripper", "mug"], "gripper": "closed"}."""
+    return isinstance(value, dict) and all(
+        (is_noun(str(key)) and (isinstance(each, dict) or is_predicate(str(each))))
+        or (is_predicate(str(key)) and isinstance(each, list) and len(each) > 1)
+        for key, each in value.items()
+    )
+
+
+def _is_goal(key: Any) -> bool:
+    return plain(str(key)).rpartition(" ")[2] in PROGRAM_WORDS["prose"]["goals"]
+
+
+def _is_test(key: Any, value: Any) -> bool:
+    role = role_of(str(key))
+    return role == "test" or (role not in ("name", "comment", "act") and states(value) and not has_action(value))
+
+
+def _is_program(key: str, value: Any) -> bool:
+    """Return whether the value of a label is a program: {"task": {"if": ..., "then": ...}}."""
+    if isinstance(value, dict) and role_of(key) != "comment":
+        return True
+    rows = [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []
+    return any(has_action(row) and any(role_of(str(key)) in STRUCTURE for key in row) for row in rows)
+
+
+def _is_always(text: str) -> bool:
+    return text.lower().strip(" .") in PROGRAM_WORDS["always"]
+
+
+def _is_machine(members: list[Any], names: Collection[str]) -> bool:
+    """Return whether a transition in a table's members leads to one of the members' names."""
+    return any(mentions(value, names) for each in members for value in _edges(each).values()) or any(
+        text in names and (role_of(key) == "transitions" or is_statement(key)) for key, text in texts_in(members)
+    )
+
+
+def _named(value: Any) -> str:
+    """Return the name that an object gives itself: {"id": "grasp"}."""
+    rows = value.items() if isinstance(value, dict) else ()
+    return next((str(each) for key, each in rows if plain(str(key)) in ("id", "name", "key", "state")), "")
+
+
+def _source(value: Any) -> str:
+    """Return the name of the state that a transition leaves."""
+    if isinstance(value, dict):
+        return str(value.get("from", value.get("source", _named(value))))
+    return str(value[0]) if isinstance(value, list) and value else ""
+
+
+def _is_reserved(name: str, value: Any) -> bool:
+    """Return whether a name has another meaning than its definition."""
+    is_word = plain(name) in ROLES or _is_always(name)
+    is_object = is_noun(name) and not any(is_told(text) for _, text in texts_in(value))
+    is_relation = plain(name) in PREDICATES and not (isinstance(value, str) and is_told(value))
+    return not name or is_word or is_object or is_relation
+
+
+def _is_skipped(row: dict[Any, Any], key: str, value: Any) -> bool:
+    """Return whether a field can be ignored: {"else": true}, or definitions, which are read where they are named."""
+    if value is None:
+        return not is_command(key)
+    role = role_of(key)
+    is_named = isinstance(value, list) and all(isinstance(each, str) for each in value)  # names of definitions
+    return (role == "definitions" and len(row) > 1 and not is_named) or (role == "else" and truth_of(value) is not None)
+
+
+def _is_answer(row: dict[Any, Any]) -> bool:
+    """Return whether an object contains the branches of a separate condition: {"true": ..., "false": ...}."""
+    roles = {role_of(str(key)) for key in row}
+    return "else" in roles and roles <= {"act", "else"}
+
+
+def _counts(value: Any) -> Counter[str]:
+    """Count the texts of a value that may refer to a definition."""
+    texts = [text for key, text in texts_in(value) if role_of(key) not in ("name", "comment")]
+    return Counter(name for text in texts for name in {text, *_AND_OR.split(text)})
+
+
+def _condition(node: Node | None) -> Expression:
+    """Convert a program that consists only of checks to a single condition."""
+    if isinstance(node, Sequence | Selector):
+        return (all_of if isinstance(node, Sequence) else any_of)(map(_condition, node.parts))
+    return node.condition if isinstance(node, Check) else TRUE
+
+
+def _has_condition(node: Node | None) -> bool:
+    return isinstance(node, Branch | Check) or any(map(_has_condition, getattr(node, "parts", ())))
+
+
+def _is_guarded(node: Node) -> bool:
+    if isinstance(node, Branch):
+        return node.condition != TRUE
+    return isinstance(node, Sequence) and bool(node.parts) and is_condition(node.parts[0])
+
+
+def _joined(nodes: list[Node], kind: str) -> Node | None:
+    """Join programs by the given kind, or by a kind inferred from their types."""
+    if not nodes:
+        return None
+    if all(map(is_condition, nodes)):
+        return Check((any_of if kind in ("selector", "not") else all_of)(map(_condition, nodes)))
+    if len(nodes) == 1:
+        return nodes[0]
+    if kind in ("sequence", "memory"):
+        if isinstance(last := nodes[-1], Branch) and last.condition == TRUE:
+            return Selector(tuple(nodes))
+        has_branch = kind == "sequence" and any(isinstance(each, Branch) for each in nodes)
+        return (Block if has_branch else Sequence)(tuple(nodes))
+    if kind:
+        return Selector(tuple(nodes))
+    if checks := next(number for number, node in enumerate(nodes) if not is_condition(node)):
+        rest = _joined(nodes[checks:], "")
+        return Sequence((*nodes[:checks], *([rest] if rest else [])))
+    guarded = [number for number, node in enumerate(nodes) if _is_guarded(node)]
+    if not guarded:
+        return Sequence(tuple(nodes))
+    waits = any(isinstance(node, Loop) for node in nodes)
+    waits |= any(isinstance(node, Action) for node in nodes[: guarded[-1]])
+    return (Block if waits else Selector)(tuple(nodes))

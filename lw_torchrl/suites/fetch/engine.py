@@ -20,10 +20,9 @@ from lw_torchrl._util.rendering import naming_absent_renderer
 from lw_torchrl.suites.engine import BodyPoses, RowModel
 from lw_torchrl.suites.fetch import FETCH
 from lw_torchrl.suites.metaworld.compiled_rows import addresses_of
+from lw_torchrl.suites.metaworld.environments import UNSTABLE, WARNED_ALREADY
 from lw_torchrl.suites.metaworld.observation import Array, Index, Mask
-from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
 from lw_torchrl.suites.metaworld.simulated_rows import ThreadedEngine
-from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY
 
 HAND_HEIGHT = 0.03
 """Height (metres) of the observed hand position above Fetch's grip site, which is between the finger pads. Meta-World's
@@ -62,7 +61,7 @@ CAMERAS = ("external_camera_0", "head_camera_rgb", "gripper_camera_rgb", "lidar"
 """Names of the cameras in Fetch's scenes."""
 
 _NOW = FETCH.past or 0  # number of values in an observation that describe the current time step
-# Columns of the numbers that are read from the state, in Fetch's axes.
+# Columns of the values that are read from MuJoCo's state, in Fetch's axes.
 _GRIP, _FINGERS, _OBJECT, _QUATERNION = slice(0, 3), slice(3, 5), slice(5, 8), slice(8, 12)
 _HAND, _HAND_QUATERNION, _DRIVEN = slice(12, 15), slice(15, 19), slice(19, 21)
 _FINGER_JOINTS = ("robot0:r_gripper_finger_joint", "robot0:l_gripper_finger_joint")
@@ -72,8 +71,11 @@ _SUCCESS = 0.05  # maximum distance to the goal at success, metres
 
 
 class _Scene(NamedTuple):
-    """A task's class in gymnasium-robotics, and the origin of Meta-World's axes in Fetch's axes (metres). An object on
-    the table is then at z = 0.018, 2 mm below the threshold for touching; the hand starts near x = 0, y = 0.6."""
+    """A task's class in gymnasium-robotics, and the origin of Meta-World's axes in Fetch's axes (metres).
+
+    With this origin, an object on the table has z = 0.018, 2 mm below the threshold of "touching the table", and the
+    hand starts near x = 0, y = 0.6.
+    """
 
     module: str
     env: str
@@ -122,7 +124,7 @@ class _Row:
         # The joints that actuators drive; controls are relative to the joint positions. Two tasks have no actuators.
         driven = [data.qpos[joint : joint + 1] for joint in self._model.jnt_qposadr[self._model.actuator_trnid[:, 0]]]
         self._target = self._model.site("target0").id
-        # Numbers that a task does not have are read from here.
+        # Zeros, from which values are read that the task does not have.
         none = np.zeros(_DRIVEN.stop)
         grip = data.site_xpos[self._model.site("robot0:grip").id]
         objects = [none[_OBJECT], none[_QUATERNION]]
@@ -180,8 +182,8 @@ class FetchEngine(ThreadedEngine):
     step. The gripper effort is relative to the current finger positions, so an effort of 0 does not hold the puck.
     Reach, push and slide keep the fingers closed.
 
-    Observations (25 values, :data:`~lw_torchrl.suites.fetch.FETCH`) are in metres and in Meta-World's axes. In reach,
-    the missing object is zeros, and the goal is a hand position, 3 cm above the grip site's goal. Errors in a row are
+    Observations (25 values, :data:`~lw_torchrl.suites.fetch.FETCH`) are in metres and in Meta-World's axes. Reach
+    has no object (zeros), and its goal is a hand position, 3 cm above the grip site's goal. Errors in a row are
     handled as in :class:`~lw_torchrl.suites.metaworld.vectorized_engine.VectorizedEngine`.
 
     Args:

@@ -15,8 +15,7 @@ from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import TASKS
 from lw_torchrl.suites.engine import Engine
-from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
-from lw_torchrl.suites.metaworld.task_programs import COMPARED_VERSIONS
+from lw_torchrl.suites.metaworld.environments import COMPARED_VERSIONS, MetaWorldEngine
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 from lw_torchrl.suites.suite import Suite
 

@@ -1,4 +1,4 @@
-"""Rows for the Numba kernel: which addresses of MuJoCo's states it reads and writes."""
+"""Describe rows for the Numba kernel: the addresses in MuJoCo's states that the kernel reads and writes."""
 
 import os
 import warnings
@@ -19,9 +19,9 @@ ROW = np.dtype(
         ("data", np.int64),
         ("substeps", np.int64),
         ("looks_ahead", np.int64),  # whether the next step may reuse this step's mj_forward
-        ("looked", np.int64),  # whether the state is that of an mj_forward
+        ("looked", np.int64),  # whether mj_forward was called on the current state
         ("looks", np.int64),  # whether a step ends with mj_forward
-        ("has_matrix", np.int64),  # whether the outputs QUATERNION are those of the outputs MATRIX
+        ("has_matrix", np.int64),  # whether to compute the outputs QUATERNION from the outputs MATRIX
         ("inputs", np.int64),  # number of inputs, which are written before the first substep
         ("zeros", np.int64),  # number of values that are set to zero after the last substep
         ("outputs", np.int64),  # number of outputs, which are read at the end
@@ -33,7 +33,7 @@ ROW = np.dtype(
         ("seconds", np.float64),  # the time that the last step took
     ]
 )
-"""One row as the compiled kernel sees it."""
+"""The dtype of a row's record, which the compiled kernel reads."""
 
 
 def addresses_of(*arrays: NDArray[Any]) -> list[int]:
@@ -103,8 +103,9 @@ class CompiledRows:
         self, rows: Index, inputs: Array, outputs: Array, run: Callable[[Callable[[], object], int], None]
     ) -> Mask:
         """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
-        ``run(call, helpers)`` runs ``call`` in this thread, where it ends when all rows are done, and in at most
-        ``helpers`` others.
+
+        ``run(call, helpers)`` runs ``call`` in this thread and in at most ``helpers`` other threads. In this thread,
+        ``call`` returns when all rows are done.
         """
         group = self._group[rows]
         seconds = np.bincount(group, self._table["seconds"][rows]) / np.maximum(np.bincount(group), 1)

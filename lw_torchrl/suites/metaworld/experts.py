@@ -15,7 +15,7 @@ from tensordict.utils import NestedKey
 from lw_torchrl._util.keys import as_keys, dispatched, read, row_mask, write
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import resolve_tasks, task_id
-from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
+from lw_torchrl.suites.metaworld.environments import import_metaworld
 
 _quiet = Lock()  # warning filters are global: two threads at the same time would not restore them correctly
 

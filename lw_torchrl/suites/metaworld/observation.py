@@ -14,8 +14,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-# Columns of the sensor array. The first 18 are in the order of the observation, but column 3 (gripper opening) is
-# computed, and so are quaternions of tasks with a matrix. Columns that a task does not use hold zeros.
+# Columns of the sensor array. The first 18 are in the order of the observation. Column 3 (the gripper opening) is
+# computed, as are the quaternions of tasks that read a rotation matrix. Columns that a task does not use are zero.
 HAND = slice(0, 3)
 GRIPPER = 3
 OBJECT = slice(4, 7)
@@ -127,8 +127,8 @@ class Observer:
         self._offset[:, SECOND] = [row.second_offset for row in sources]
 
     def observe(self, sensors: Array) -> Array:
-        """Change the sensors (rows, WIDTH) in the columns CURRENT to the part of the observation that describes the
-        current state; return a view of these columns."""
+        """Convert the columns CURRENT of the sensors (rows, WIDTH) in place to the part of the observation that
+        describes the current state, and return a view of these columns."""
         current = sensors[:, CURRENT]
         current += self._offset
         span = row_norm(sensors[:, RIGHT_CLAW] - sensors[:, LEFT_CLAW])

@@ -1,4 +1,4 @@
-"""The building blocks of dense rewards: parameters from data/rewards.toml as arrays, features, and reward terms."""
+"""The building blocks of dense rewards: features, reward terms, and the parameters from data/rewards.toml as arrays."""
 
 from __future__ import annotations
 
@@ -96,9 +96,9 @@ def _points(reward: TaskReward) -> list[list[list[list[int]]]]:
 
 
 def _less(term: Term) -> float:
-    """Return the offset that is subtracted from the distance between the margin's two points. The margin is the
-    absolute value of the difference. A constant margin uses two identical points, so its distance is 0 and the offset
-    alone gives the margin.
+    """Return the offset of a margin, which is ``abs(distance - offset)``.
+
+    The distance is between two reference points; for a constant margin, both points are identical.
     """
     if isinstance(term.margin, tuple):
         return term.less
@@ -148,7 +148,7 @@ def gaussian(margins: Array) -> Array:
 
 
 def tolerance(x: Array, lower: Array | float, upper: Array | float, margin: Array | float) -> Array:
-    """Return 1 for x from ``lower`` to ``upper``, and a long tail outside (0 if the margin is 0)."""
+    """Return 1 for x in [``lower``, ``upper``]; outside, a value that decays with distance (0 if the margin is 0)."""
     margins = np.where(x < lower, lower - x, x - upper) / margin
     return np.where((lower <= x) & (x <= upper), 1.0, long_tail(margins))
 

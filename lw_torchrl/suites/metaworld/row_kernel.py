@@ -1,4 +1,4 @@
-"""The Numba kernel that simulates many rows in one call: MuJoCo's own functions, without Python between the rows.
+"""The Numba kernel that simulates many rows in one call, with MuJoCo's own functions and no Python between the rows.
 
 MuJoCo's functions are called through their addresses in the library that MuJoCo's Python bindings have loaded, so the
 results are bit-identical to those of the bindings. Importing this module raises an error if Numba or one of the
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl.suites.metaworld import observation
 from lw_torchrl.suites.metaworld.compiled_rows import ROW
-from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY, Places
+from lw_torchrl.suites.metaworld.environments import WARNED_ALREADY, Places
 
 if sys.platform != "linux":
     raise ImportError("the compiled simulation was tested on Linux only")
@@ -88,7 +88,7 @@ def pointer(typing: Any, address: Any) -> Any:
 
 @intrinsic
 def add_atomically(typing: Any, address: Any, number: Any) -> Any:
-    """Add to an int64 and return its old value, while other threads do the same."""
+    """Add to an int64 atomically (other threads may do the same), and return the old value."""
 
     def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
@@ -112,7 +112,7 @@ def setjmp(typing: Any, buffer: Any) -> Any:
 
 @cfunc(types.void(_pointer), cache=True)
 def leave_mujoco(message: Any) -> None:
-    """Handle an error of MuJoCo, whose own handler ends the process: return to the ``setjmp`` of this thread."""
+    """Handle a MuJoCo error by returning to the ``setjmp`` of this thread; MuJoCo's own handler ends the process."""
     longjmp(get_of_thread(jump_key()), 1)
 
 
@@ -189,8 +189,9 @@ def simulate(
     step call this function at once, with the same arrays.
 
     ``handler`` is the address of :func:`leave_mujoco`; ``table`` is a table of :data:`ROW`; ``rows`` (n,) int64 are the
-    rows to simulate, and ``order`` (n,) int64 says in which order. ``counts`` (2,) int64 are the numbers of rows taken
-    and done. Reads ``inputs`` (n, K) float64; writes ``outputs`` (n, W) float64 and ``stable`` (n,) bool.
+    rows to simulate, and ``order`` (n,) int64 is the order in which to simulate them. ``counts`` (2,) int64 are the
+    numbers of rows that threads have taken and finished. Reads ``inputs`` (n, K) float64; writes ``outputs`` (n, W)
+    float64 and ``stable`` (n,) bool.
     """
     jump, scratch = np.empty(128, np.int64), np.empty(2, np.int64)
     set_of_thread(jump_key(), pointer(jump.ctypes.data))

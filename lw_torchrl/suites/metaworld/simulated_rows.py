@@ -1,4 +1,4 @@
-"""Rows (MuJoCo states on shared models), and a base class for engines that simulate groups of rows in threads."""
+"""Rows (MuJoCo states that share models) and a base class for engines that simulate groups of rows in threads."""
 
 import os
 import threading
@@ -22,10 +22,9 @@ from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
 from lw_torchrl.suites.metaworld import observation as at
 from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel
+from lw_torchrl.suites.metaworld.environments import UNSTABLE, WARNED_ALREADY, SharedModel
 from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, StateView
-from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
 from lw_torchrl.suites.metaworld.tables import TaskReward, TaskSources
-from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY, SharedModel
 
 _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
@@ -145,7 +144,7 @@ def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
 
 
 class WorkerPool:
-    """A pool of threads. The calling thread works too, so a pool of one thread has no other."""
+    """A pool of threads. The calling thread is one of them, so a pool of N threads starts N - 1 threads."""
 
     def __init__(self, num_threads: int) -> None:
         self._helpers = num_threads - 1
@@ -180,7 +179,7 @@ class WorkerPool:
         self._idle = True
 
     def _finish(self) -> None:
-        """Let no other thread start the call, and wait for those that have started."""
+        """Prevent other threads from starting the call, and wait for the threads that have started it."""
         self._call[0] = _do_nothing
         for busy in self._busy if self._process == os.getpid() else ():
             with busy:
@@ -243,8 +242,10 @@ def _stop(call: list[Callable[[], object] | None], wakes: Sequence[threading.Loc
 
 
 class ThreadedEngine(SeenRows):
-    """Base class for engines that simulate physics in threads (by default one per core). Rows with the same key share a
-    model."""
+    """Base class for engines that simulate physics in parallel threads (one per core by default).
+
+    Rows with the same key share a MuJoCo model.
+    """
 
     _rows: list[Any]  # each has ``seen`` and ``bodies``
 
@@ -258,14 +259,14 @@ class ThreadedEngine(SeenRows):
         self._compiled: CompiledRows | None = None
 
     def _compile(self) -> None:
-        """Simulate the rows with the Numba kernel, if there is one."""
+        """Set up the Numba kernel to simulate the rows, if Numba is available."""
         if (kernel := find_row_kernel()) is not None:
             self._compiled = CompiledRows(kernel, self._rows, [group.rows for group in self._groups])
 
     def _simulate(self, rows: Index, inputs: Array, outputs: Array) -> Mask:
         """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
 
-        Without the kernel, Python threads give the same bits, more slowly: they make ten Python calls a row.
+        Without the kernel, Python threads compute bit-identical results, but need ten slow Python calls per row.
         """
         if self._compiled is not None:
             return self._compiled.simulate(rows, inputs, outputs, self._pool.run)

@@ -11,8 +11,8 @@ from lw_torchrl._util.checks import Count, typed
 from lw_torchrl._util.reproducibility import version_changes
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
+from lw_torchrl.suites.metaworld import environments, simulated_rows
 from lw_torchrl.suites.metaworld import observation as at
-from lw_torchrl.suites.metaworld import simulated_rows, task_programs
 from lw_torchrl.suites.metaworld.dense_reward import DenseReward, EpisodeStarts
 from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, Observer, SuccessFunction
 from lw_torchrl.suites.metaworld.tables import reward_table, simulation_table
@@ -23,9 +23,9 @@ FINGERS = np.array([1.0, -1.0])  # one action value moves both fingers, in oppos
 class VectorizedEngine(simulated_rows.ThreadedEngine):
     """An engine that simulates physics in threads and computes everything else in NumPy for all rows at once.
 
-    With Numba (``lw_torchrl[fast]``, on Linux), one compiled call simulates all rows; otherwise a warning says why not.
-    With or without it and for any number of threads, the results are bit-identical to those of
-    :class:`~lw_torchrl.suites.metaworld.plain_engine.MetaWorldEngine`. Rows with the same XML file share a compiled
+    With Numba (``lw_torchrl[fast]``, on Linux), one compiled call simulates all rows; without it, a warning states the
+    reason. In both cases and for any number of threads, the results are bit-identical to those of
+    :class:`~lw_torchrl.suites.metaworld.environments.MetaWorldEngine`. Rows with the same XML file share a compiled
     model.
 
     A row faults if the action is not finite, the simulation becomes unstable or MuJoCo raises an error. The row then
@@ -52,23 +52,23 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
     def __init__(
         self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: Count | None = None
     ) -> None:
-        compared = task_programs.COMPARED_VERSIONS
+        compared = environments.COMPARED_VERSIONS
         if changes := version_changes(compared, compared):
             raise ImportError(
                 f"engine: the vectorized engine was verified against other versions ({', '.join(changes)}); install "
                 "the verified versions, or use engine='metaworld', which supports any version"
             )
         dense, tasks = reward == "dense", [check_task(task) for task in tasks]
-        super().__init__([task_programs.model_path(task) for task in tasks], METAWORLD, num_threads)
+        super().__init__([environments.model_path(task) for task in tasks], METAWORLD, num_threads)
         rewards = [reward_table()[task] if dense else None for task in tasks]
         rows: dict[int, simulated_rows.SimulatedRow] = {}
-        models: list[task_programs.SharedModel] = []
+        models: list[environments.SharedModel] = []
         # The models are given back even if the engine is never closed.
-        self._return_models = weakref.finalize(self, task_programs.return_models, models)
+        self._return_models = weakref.finalize(self, environments.return_models, models)
         for group in self._groups:
-            models.append(task_programs.borrow_model(task_programs.model_path(tasks[group.rows[0]])))
+            models.append(environments.borrow_model(environments.model_path(tasks[group.rows[0]])))
             programs = {
-                task: task_programs.program_class(task)(models[-1].model) for task in {tasks[row] for row in group.rows}
+                task: environments.program_class(task)(models[-1].model) for task in {tasks[row] for row in group.rows}
             }
             for row in group.rows:
                 sources, program = simulation_table()[tasks[row]], programs[tasks[row]]

@@ -9,8 +9,8 @@ import pytest
 import lw_torchrl as lw
 from benchmarks.paper import recipes, runs, schedule
 from benchmarks.paper.__main__ import main
-from benchmarks.paper.recipes import OFFLINE_TABLES, PRESETS, DataSetting, Member
-from benchmarks.paper.schedule import run_command, run_commands
+from benchmarks.paper.recipes import PRESETS, DataSetting, Member
+from benchmarks.paper.schedule import run_commands
 
 
 @pytest.fixture
@@ -33,6 +33,7 @@ def arguments(out, *more, methods=("pcbc", "dc"), seeds=(0, 1)):
     return ("few-shot", "--seeds", *seeds, "--methods", *methods, "--episodes", 1, "--out", out, *more)
 
 
+@pytest.mark.slow
 def test_command_runs_and_summarizes(capsys, tmp_path, tiny):
     names = run(capsys, *arguments(tmp_path, "--list")).split()
     assert names == [
@@ -57,55 +58,6 @@ def test_command_runs_and_summarizes(capsys, tmp_path, tiny):
     assert summary["published_means"]["PCBC published, last"] == pytest.approx(0.393, abs=1e-3)
     assert (folder / "tasks.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "dc" / "seed1" / "results.json").read_text() == first
-
-
-@pytest.mark.slow
-def test_best_of_several_evaluations_is_reported(capsys, tmp_path, tiny):
-    out = run(capsys, *arguments(tmp_path, "--preset", "paper", "--passes", 50, methods=["dc"]))
-    assert "| dc, best of the last 3 evaluations " in out
-    folder = tmp_path / "few-shot" / "paper"
-    means = json.loads((folder / "summary.json").read_text())["published_means"]
-    best = [json.loads((folder / f"dc/seed{seed}/results.json").read_text())["config"]["best"] for seed in (0, 1)]
-    expected = sum(sum(one["rates"].values()) for one in best) / 100
-    assert means["dc, best of the last 3 evaluations"] == pytest.approx(expected)
-
-
-def test_other_plans_have_their_own_folder(capsys, tmp_path, tiny):
-    folder = tmp_path / "compare/best/llama3.1/chain_py"  # as benchmarks.plan_comparison writes it
-    lw.save_plans({"push": lw.load_plans("MT10")["push"]}, folder)
-    given = arguments(tmp_path, "--plans", "MT50", folder, "--list", methods=["pcbc"], seeds=[0])
-    assert run(capsys, *given).split()[1:] == ["few-shot/strong-MT50+llama3.1-chain_py/pcbc/seed0"]
-    with pytest.raises(ValueError, match="plans have no plan for assembly, "):
-        main([str(one) for one in arguments(tmp_path, "--plans", folder, "--list")])
-
-
-def test_wrong_choices_raise(tmp_path):
-    for given, message in {
-        ("one-shot", "--preset", "one-network"): "--preset one-network is only for few-shot, got one-shot",
-        ("few-shot", "--passes", "3"): "--passes requires --preset paper",
-        ("few-shot", "--run", "few-shot/strong/pbc/seed0"): "did you mean 'few-shot/strong/pcbc/seed0'",
-        ("offline", "quick", "--mixtures", "B"): "leave no run of the table quick",
-    }.items():
-        with pytest.raises(ValueError, match=message):
-            main([*given, "--out", str(tmp_path / "out")])
-    assert not (tmp_path / "out").exists()
-
-
-def test_every_row_of_every_offline_table_is_listed(capsys, tmp_path):
-    names = run(capsys, "offline", "all", "--list", "--out", tmp_path).split()
-    assert len({*names}) == len(names)
-    for name, table in OFFLINE_TABLES.items():
-        for mixture in table.rows:
-            assert (f"{table.tasks}/{mixture}/advantage-plan/seed2" in names) == (name != "quick")
-    names = run(capsys, "offline", "methods", "--list", "--mixtures", "C", "--methods", "bc", "--out", tmp_path).split()
-    assert names[-3:] == [f"five/C/bc-plan/seed{seed}" for seed in range(3)]
-
-
-@pytest.mark.slow
-def test_command_runs_in_a_process():
-    assert "few-shot/strong/dc/seed0" in run_command(["few-shot", "--list"])
-    with pytest.raises(RuntimeError, match=r"benchmarks.paper few-shot --run nonsense failed:\n(.*\n)*.*--run must be"):
-        run_command(["few-shot", "--run", "nonsense"])
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """Episodes of Fetch: gymnasium-robotics' own, the engine's, and those of plans with scripted skills."""
 
-from __future__ import annotations
-
 import gymnasium
 import gymnasium_robotics
 import numpy as np

@@ -1,7 +1,5 @@
 """FetchEngine against gymnasium-robotics, bit for bit."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np
@@ -10,7 +8,7 @@ import pytest
 pytest.importorskip("gymnasium_robotics")
 from fetch_runs import IDS, engine_episode, gymnasium_episode, random_actions, scripted
 
-from lw_torchrl.suites.fetch import FETCH, FetchEngine
+from lw_torchrl.suites.fetch import FetchEngine
 from lw_torchrl.suites.fetch import engine as fetch_engine
 
 STEPS = 50
@@ -72,38 +70,6 @@ def test_inactive_rows_repeat_their_observation():
     engine.close()
 
 
-def test_objects_rest_on_the_table_and_reach_has_none():
-    engine = FetchEngine(sorted(IDS), num_threads=1)
-    numbers = engine.reset(range(4), range(4))
-    things, reach = numbers[[0, 1, 3]], numbers[2]
-    assert numbers.dtype == np.float64
-    assert numbers.shape == (4, FETCH.size)
-    assert ((things[:, 6] > 0.015) & (things[:, 6] < 0.0195)).all()
-    np.testing.assert_allclose(numbers[:, :2], [[0.0, 0.6]] * 4, atol=0.005)
-    assert not reach[4:11].any()
-    engine.close()
-
-
-def test_actions_move_the_hand_along_our_axes():
-    engine = FetchEngine(["fetch/pick-and-place"] * 3, num_threads=1)
-    first = engine.reset(range(3), [0] * 3)
-    for _ in range(5):
-        found = engine.step(np.eye(4, dtype=np.float32)[:3], np.ones(3, bool)).observation
-    moved = found[:, :3] - first[:, :3]
-    np.testing.assert_allclose(moved, np.eye(3) * 0.157, atol=0.008)
-    engine.close()
-
-
-def test_effort_of_one_closes_the_gripper():
-    engine = FetchEngine(["fetch/pick-and-place"], num_threads=1)
-    engine.reset([0], [0])
-    for effort, opening in ((-1.0, 1.0), (0.0, 1.0), (1.0, 0.0)):
-        for _ in range(10):
-            found = engine.step(np.array([[0, 0, 0, effort]], np.float32), np.ones(1, bool)).observation
-        assert found[0, 3] == pytest.approx(opening, abs=0.02)
-    engine.close()
-
-
 def test_fault_stays_in_its_row():
     engine = FetchEngine(["fetch/push"] * 3, num_threads=2)
     alone = FetchEngine(["fetch/push"], num_threads=1)
@@ -127,7 +93,7 @@ def test_recording_shows_the_goal_and_changes_nothing():
     engine, other = (FetchEngine(["fetch/push"], num_threads=1) for _ in range(2))
     engine.reset([0], [0]), other.reset([0], [0])
     for action in random_actions(0, 5):
-        poses, model = engine.poses(0), engine.model(0)
+        poses, model = engine.poses(0), engine.row_model(0)
         assert poses.position.shape == (model.model.nbody, 3)
         assert model.path.endswith("push.xml")
         site = engine._rows[0].data.site("target0").xpos

@@ -1,7 +1,5 @@
 """The compiled simulation: the bits of Python threads, errors of MuJoCo, forks, threads and Ctrl-C."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import re
@@ -22,8 +20,8 @@ from test_vectorized_engine import SHARING, TASKS, VARIED, differences, play, sa
 
 from lw_torchrl.suites.metaworld import row_kernel, simulated_rows
 from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel
+from lw_torchrl.suites.metaworld.environments import WARNED_ALREADY
 from lw_torchrl.suites.metaworld.simulated_rows import RowGroup, WorkerPool
-from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 STATE = ("qpos", "qvel", "qacc", "qacc_warmstart", "xpos", "xquat", "site_xpos", "efc_force", "time")
@@ -276,16 +274,6 @@ def test_engine_warns_once_and_simulates_in_python_threads(change, reason, monke
         assert same_bits(play(engines[0], ["reach"], 3)[-1], expected).all()
     finally:
         find_row_kernel.cache_clear()
-
-
-def test_places_of_a_row_replace_those_of_its_model():
-    engine = VectorizedEngine(["plate-slide", "plate-slide-back"], num_threads=1)
-    model, places = engine._rows[0]._model, engine._rows[0]._places
-    struct = row_kernel.model_with_places(model, places)
-    original = np.ctypeslib.as_array((ctypes.c_int64 * len(struct)).from_address(model._address))
-    changed = np.flatnonzero(struct != original)
-    assert original[changed].tolist() == [model.body_pos.ctypes.data, model.site_pos.ctypes.data]
-    assert struct[changed].tolist() == [places[0].ctypes.data, places[1].ctypes.data]
 
 
 def memory() -> int:

@@ -1,7 +1,5 @@
 """The dense reward of all rows at once against Meta-World's own, bit for bit."""
 
-from __future__ import annotations
-
 import warnings
 from collections import defaultdict
 from types import SimpleNamespace
@@ -12,7 +10,8 @@ from metaworld.policies import ENV_POLICY_MAP
 from metaworld.utils import reward_utils
 
 from lw_torchrl.suites.metaworld import reward_terms as terms
-from lw_torchrl.suites.metaworld.dense_reward import DenseReward, EpisodeStarts
+from lw_torchrl.suites.metaworld.dense_reward import FORMULAS, LIFTS, DenseReward, EpisodeStarts
+from lw_torchrl.suites.metaworld.environments import MetaWorldEngine
 from lw_torchrl.suites.metaworld.observation import (
     CORNERS,
     HAND,
@@ -20,7 +19,6 @@ from lw_torchrl.suites.metaworld.observation import (
     LEFT_CLAW,
     LEFT_PAD,
     LEFT_TIP,
-    MATRIX,
     OBJECT,
     PLACE,
     QUATERNION,
@@ -31,8 +29,6 @@ from lw_torchrl.suites.metaworld.observation import (
     Observer,
     StateView,
 )
-from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
-from lw_torchrl.suites.metaworld.reward_formulas import FORMULAS, LIFTS
 from lw_torchrl.suites.metaworld.simulated_rows import SimulatedRow
 from lw_torchrl.suites.metaworld.tables import reward_table, simulation_table
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
@@ -249,9 +245,3 @@ def test_missing_attribute_of_metaworld_raises():
     starts = EpisodeStarts([reward_table()["window-open"]])
     with pytest.raises(AttributeError, match="window_handle_pos_init"):
         starts.begin(0, SimpleNamespace(obj_init_pos=np.zeros(3), init_tcp=np.zeros(3)))
-
-
-def test_sparse_reward_reads_fewer_sensors():
-    sparse, dense = (VectorizedEngine(["stick-pull"], reward=kind, num_threads=1) for kind in ("sparse", "dense"))
-    assert len(sparse._rows[0]._sensor_index) == MATRIX.stop + 10
-    assert len(dense._rows[0]._sensor_index) == CORNERS.stop

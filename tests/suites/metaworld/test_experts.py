@@ -1,7 +1,5 @@
 """ExpertActor against Meta-World's scripted policies."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 
@@ -9,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from metaworld.policies import ENV_POLICY_MAP
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 import lw_torchrl as lw
@@ -99,23 +97,3 @@ def test_scripts_warnings_are_hidden_and_filters_restored(states):
     script, own = ENV_POLICY_MAP["push-v3"](), states["observation"][lw.task_id("push")].double().numpy()
     with pytest.warns(UserWarning, match="may be too high"):
         np.apply_along_axis(script.get_action, -1, own)
-
-
-def test_experts_succeed():
-    tasks = ["button-press-topdown", "door-close", "drawer-close", "handle-press", "reach", "window-open"]
-    env = lw.LanguageWorldEnv(tasks, num_envs=12, seed=0)
-    rollout = env.rollout(150, lw.ExpertActor(tasks))
-    assert rollout["next", "success"].any(1).all()
-    env.close()
-
-
-def test_wrong_task_ids_and_shapes_raise():
-    expert = lw.ExpertActor(["reach", "push"])
-    data = TensorDict({"observation": torch.zeros(2, 39), "task_id": torch.tensor([lw.task_id("reach"), 0])}, [2])
-    for wrong in (0, 50, -1):
-        data["task_id"][1] = wrong
-        with pytest.raises(ValueError, match=f"task_id {wrong} .*push, reach"):
-            expert(data)
-    for observation, ids in ((torch.zeros(2, 3, 39), torch.zeros(2)), (torch.zeros(2, 38), torch.zeros(2))):
-        with pytest.raises(ValueError, match="task_id"):
-            expert(TensorDict({"observation": observation, "task_id": ids.long()}, [2]))

@@ -1,7 +1,5 @@
 """The shortened first substep, which reuses the last step's mj_forward."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 
@@ -53,17 +51,3 @@ def test_first_step_of_an_episode_is_not_shortened(monkeypatch):
     assert calls == []
     engine.step(np.zeros((1, 4)), np.ones(1, bool))
     assert len(calls) == 1
-
-
-def test_assumptions_of_the_shortened_substep_hold():
-    for row in VectorizedEngine(TASKS, num_threads=1)._rows:
-        model = row._model
-        (body,) = np.flatnonzero(model.body_mocapid >= 0)
-        own = model.geom_bodyid == body
-        assert not model.geom_contype[own].any()
-        assert not model.geom_conaffinity[own].any()
-        assert not (model.body_parentid == body).any()
-        assert model.neq == 1
-        assert model.eq_type[0] == mujoco.mjtEq.mjEQ_WELD
-        assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
-        assert model.nsensor == 0

@@ -1,19 +1,99 @@
-"""Run Meta-World's own resets on compiled models that rows share."""
+"""Meta-World's own environments: an engine that steps them in a loop, and their resets on models that rows share."""
 
 from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
+from lw_torchrl._util.checks import Count, typed
+from lw_torchrl._util.rendering import naming_absent_renderer
+from lw_torchrl.language.layout import METAWORLD
+from lw_torchrl.language.tasks import check_task
+from lw_torchrl.suites.cameras import SeenRows
+from lw_torchrl.suites.engine import EngineStep, RowModel
+
+UNSTABLE = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+"""A slice of MuJoCo's warnings that selects the three about an unstable simulation: bad positions, velocities and
+accelerations."""
+
+
+def import_metaworld() -> Any:
+    """Import Meta-World; raise an ImportError that names the rendering library if it is missing."""
+    with naming_absent_renderer():
+        import metaworld
+        import metaworld.policies
+    return metaworld
+
+
+def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
+    """Return Meta-World's environment for a task, with an observable goal and a new initial state at every reset. Seed
+    the environment with ``env.seed(seed)``: Meta-World ignores ``reset(seed=...)``."""
+    import_metaworld()
+    from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
+
+    check_task(task)
+    env = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-v3-goal-observable"](seed=0)
+    env._freeze_rand_vec = False
+    env.seeded_rand_vec = True
+    env.max_path_length = max_steps
+    return env
+
+
+class MetaWorldEngine(SeenRows):
+    """An engine that runs the original Meta-World environments in a loop, in one thread. It is slow and serves as the
+    reference for the vectorized engine."""
+
+    @typed
+    def __init__(
+        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: Count | None = None
+    ) -> None:
+        self._dense = reward == "dense"
+        # LanguageWorldEnv truncates episodes, so Meta-World must not.
+        self._envs = [make_metaworld_env(task, max_steps=2**31 - 1) for task in tasks]
+        self._last = np.zeros((len(self._envs), METAWORLD.size))
+
+    def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
+        for row, seed in zip(rows, seeds, strict=True):
+            env = self._envs[row]
+            env.seed(seed)
+            env._did_see_sim_exception = False
+            self._last[row] = env.reset()[0]
+        return self._last[list(rows)]
+
+    def step(self, action: NDArray[np.float32], active: NDArray[np.bool_]) -> EngineStep:
+        n = len(self._envs)
+        reward, success, fault = np.zeros(n), np.zeros(n, bool), np.zeros(n, bool)
+        for row in np.flatnonzero(active):
+            env = self._envs[row]
+            observation, dense, _, _, info = env.step(action[row])
+            # MuJoCo silently restarts an unstable simulation and only counts a warning, which a reset clears.
+            warned = env.data.warning.number[UNSTABLE].any()
+            if warned or env._did_see_sim_exception or not np.isfinite(observation).all():
+                fault[row] = True
+                continue
+            self._last[row] = observation
+            success[row] = bool(info["success"])
+            reward[row] = dense if self._dense else success[row]
+        return EngineStep(self._last.copy(), reward, success, fault)
+
+    def _seen(self, row: int) -> tuple[RowModel, Any]:
+        env = self._envs[row]
+        return RowModel(str(env.model_name), env.model), env.data
+
+    def close(self) -> None:
+        super().close()
+        for env in self._envs:
+            env.close()
+        self._envs = []
+
 
 COMPARED_VERSIONS = {"metaworld": "3.1.1", "mujoco": "3.3.0"}
 """The versions of Meta-World and MuJoCo against which the vectorized engine was verified bit for bit."""
@@ -22,8 +102,11 @@ Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class SharedModel:
-    """A compiled model that many rows use in turn. Meta-World's resets change the positions of bodies and sites in the
-    model itself. So each row stores its positions, and loads them into the model unless the row is the ``holder``."""
+    """A compiled model that many rows use in turn.
+
+    Meta-World's resets change the positions of bodies and sites in the model itself. So each row stores its own
+    positions, and loads them before it uses the model, unless it was the last row to do so (the ``holder``).
+    """
 
     def __init__(self, path: str, model: Any, compiled: Places | None = None) -> None:
         self.path, self.model = path, model

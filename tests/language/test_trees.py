@@ -1,0 +1,243 @@
+"""JSON and YAML of any shape: the structure and the texts determine the plan, not the names of the keys."""
+
+import json
+import tomllib
+from pathlib import Path
+from time import process_time
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lw_torchrl as lw
+from lw_torchrl.language.expressions import evaluate, leaves
+from lw_torchrl.language.formats.trees import TreeReading
+from lw_torchrl.language.formats.values import parse_value
+from lw_torchrl.language.objects import GRIPPER
+from lw_torchrl.language.programs import compile_program
+
+TEXTS = [Path(__file__).parent / name for name in ("tree_shapes.toml", "program_shapes.toml")]
+SHAPES = {name: shape for path in TEXTS for name, shape in tomllib.loads(path.read_text("utf-8")).items()}
+
+
+def active_verbs(plan, near, is_open):
+    """Return the first words of the active steps; all conditions but two are false."""
+    verbs = []
+    for step in plan.steps:
+        truth = {
+            clause: near if clause.predicate == "near" and clause.subject == GRIPPER else is_open
+            for clause in leaves(step.condition.expression)
+            if clause.predicate in ("near", "open") and clause.subject == GRIPPER
+        }
+        truth = {clause: truth.get(clause, False) for clause in leaves(step.condition.expression)}
+        if evaluate(step.condition.expression, truth):
+            verbs.append(step.skill.split()[0].lower())
+    return verbs
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_every_shape_of_a_policy_is_the_same_plan(name):
+    plan = lw.decode_plan(SHAPES[name], "push").plan
+    assert plan is not None
+    assert len(plan.steps) == 3
+    found = [active_verbs(plan, near, is_open) for near in (True, False) for is_open in (True, False)]
+    assert found == [["close"], ["push"], ["move"], ["move"]]
+
+
+FACTS = {"a": "gripper near puck", "b": "gripper open", "c": "puck above wall", "d": "puck near target location"}
+policies = st.recursive(
+    st.integers(0, 99),
+    lambda inner: st.tuples(st.sampled_from("abcd"), st.booleans(), inner, inner),
+    max_leaves=6,
+)
+KEYS = [("if", "then", "else"), ("query", "on_true", "on_false"), ("situation", "response", "otherwise"),
+        ("when", "run", "default"), ("Is it so", "yes", "no")]  # fmt: skip
+
+
+def spell(draw, policy):
+    """Return a policy as a JSON value in one of many spellings."""
+    if isinstance(policy, int):
+        text = f"move to {policy}"
+        return draw(st.sampled_from([{"do": text}, {"type": "action", "text": text}, {"Action": text}, {"unit": text}]))
+    fact, negated, then, otherwise = policy
+    test = FACTS[fact]
+    if negated:
+        test = draw(st.sampled_from([{"not": test}, f"not ({test})", {"type": "inverter", "child": {"check": test}}]))
+    then, otherwise = spell(draw, then), spell(draw, otherwise)
+    style = draw(st.sampled_from(["keys", "tree", "arrows", "rules", "pairs"]))
+    if style == "keys":
+        return dict(zip(draw(st.sampled_from(KEYS)), (test, then, otherwise), strict=True))
+    if style == "tree":
+        check = {"type": "condition", "query": test}
+        first = {"type": "sequence", "name": "first", "children": [check, then]}
+        return {"type": "selector", "name": "root", "children": [first, otherwise]}
+    if style == "arrows":
+        return {"?": [{"->": [{"check": test}, then]}, otherwise]}
+    if style == "rules":
+        return {"rules": [{"when": test, "do": then}], "otherwise": otherwise}
+    return {"policy": [[{"check": test}, then], ["otherwise", otherwise]]}
+
+
+def carried_out(policy, truth):
+    while not isinstance(policy, int):
+        policy = policy[2] if truth[policy[0]] != policy[1] else policy[3]
+    return policy
+
+
+@settings(max_examples=150)
+@given(st.data(), policies)
+def test_a_spelled_policy_activates_the_actions_that_it_carries_out(data, policy):
+    text = json.dumps(spell(data.draw, policy))
+    steps = compile_program(TreeReading(text).section.tree)
+    for number in range(16):
+        truth = {fact: bool(number >> place & 1) for place, fact in enumerate("abcd")}
+        texts = {FACTS[fact]: value for fact, value in truth.items()} | {
+            f"not ({FACTS[fact]})": not value for fact, value in truth.items()
+        }
+        active = {int(step.action.text.split()[-1]) for step in steps if evaluate(step.guard, texts)}
+        assert active == {carried_out(policy, truth)}, text
+
+
+WORDS = (
+    "if", "then", "else", "elif", "not", "until", "to", "from", "states", "transitions", "next", "start", "type",
+    "selector", "id", "1", "?", "->", "near", "open", "gripper", "push", "gripper near puck", "close the gripper",
+)  # fmt: skip
+words = st.sampled_from(WORDS)
+values = st.recursive(
+    st.none() | st.booleans() | st.integers(0, 3) | words,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(words, inner, max_size=4),
+    max_leaves=15,
+)
+
+
+@settings(max_examples=300)
+@given(values)
+def test_no_value_raises_an_error(value):
+    lw.decode_plan(json.dumps(value), "push")
+
+
+NEAR, OPEN = "the robot's gripper is near the puck", "the robot's gripper is open"
+NOT_NEAR, NOT_OPEN = (text.replace("is", "is not") for text in (NEAR, OPEN))
+CONDITIONS = [
+    ({"left": "gripper", "rel": "is near", "right": "puck"}, NEAR),
+    ({"a": "gripper", "op": "not near", "b": "puck"}, NOT_NEAR),
+    ({"a": "gripper", "op": "is not", "b": "open"}, NOT_OPEN),
+    ({"lhs": "gripper.state", "op": "!=", "rhs": "open"}, NOT_OPEN),
+    ({"lhs": "distance(gripper, puck)", "op": ">", "rhs": 0.05}, NOT_NEAR),
+    ({"metric": "distance", "from": "gripper", "to": "puck", "op": ">", "value": 0.05}, NOT_NEAR),
+    ({"distance_between": ["gripper", "puck"], "less_than": 0.05}, NEAR),
+    ({"not": {"near": ["gripper", "puck"]}}, NOT_NEAR),
+    ({"not_near": ["gripper", "puck"]}, NOT_NEAR),
+    ({"gripper": "not open"}, NOT_OPEN),
+    ({"predicate": "near", "args": ["gripper", "puck"], "expect": False}, NOT_NEAR),
+    ({"near": ["gripper", "puck"], "none": ["gripper open"]}, f"{NEAR} and {NOT_OPEN}"),
+    (
+        {"op": "and", "left": {"near": ["gripper", "puck"]}, "right": {"not": {"open": "gripper"}}},
+        f"{NEAR} and {NOT_OPEN}",
+    ),
+    ({"==": [{"var": "gripper.state"}, "open"]}, OPEN),
+    ("¬near(gripper, puck)", NOT_NEAR),
+]
+
+
+@pytest.mark.parametrize(("condition", "query"), CONDITIONS)
+def test_conditions_in_parts_and_their_negations(condition, query):
+    rules = {"rules": [{"when": condition, "do": "lift the puck"}, {"do": "wait"}]}
+    assert str(lw.decode_plan(json.dumps(rules), "push").plan.steps[0].condition) == query
+
+
+@pytest.mark.parametrize("key", ["achieved_if", "done_when", "goal_test", "satisfied", "skip_if", "effect"])
+def test_the_steps_of_a_subgoal_run_until_it_is_achieved(key):
+    steps = [
+        {"if": "gripper near puck", "do": "close the gripper"},
+        {"else": True, "do": "move the gripper to the puck"},
+    ]
+    subgoals = [
+        {"name": "hold it", key: ["gripper near puck", "gripper closed"], "how": steps},
+        {"name": "push it", key: "puck near target location", "how": [{"do": "push the puck to the target location"}]},
+    ]
+    plan = lw.decode_plan(json.dumps({"subgoals": subgoals}), "push").plan
+    assert [str(step.condition).replace("the robot's gripper is ", "") for step in plan.steps] == [
+        "not closed and near the puck",
+        "not near the puck",
+        "near the puck and closed and the puck is not near the target location",
+    ]
+
+
+def test_an_unknown_condition_among_rules_is_not_a_title():
+    rules = {"Monday comes": "close the gripper", "gripper near puck": "push the puck", "otherwise": "lift the puck"}
+    plan = lw.decode_plan(json.dumps(rules), "push").plan
+    assert [(str(step.condition), step.skill) for step in plan.steps] == [
+        (NEAR, "push the puck"),
+        (NOT_NEAR, "lift the puck"),
+    ]
+
+
+def test_actions_without_a_place_in_the_program_are_named():
+    text = (
+        '{"if": "gripper open", "then": "close the gripper", "goal": "done", "extras": {"until": "push the puck away"}}'
+    )
+    notes = "\n".join(map(str, lw.decode_plan(text, "push").notes))
+    assert "'push the puck away' is left out" in notes
+
+
+ALTERNATIVES = """
+def reach(hand, puck):
+    if np.linalg.norm(hand[:2] - puck[:2]) > 0.02:
+        return "move above the puck"
+    return None
+
+def policy(hand, puck):
+    {}
+"""
+
+
+@pytest.mark.parametrize(
+    "line", ["return reach(hand, puck) or 'grasp the puck'", "return reach(hand, puck) or robot.grasp('the puck')"]
+)
+def test_the_first_helper_that_returns_an_action_acts(line):
+    decoded = lw.decode_plan(ALTERNATIVES.format(line), "push")
+    aligned = "the robot's gripper is vertically aligned with the puck"
+    assert [(str(step.condition), step.skill) for step in decoded.plan.steps] == [
+        (aligned.replace("is", "is not", 1), "move above the puck"),
+        (aligned, "grasp the puck"),
+    ]
+
+
+def test_texts_of_actions_that_no_path_reaches_are_named():
+    lines = ["if near(hand, puck): return 'grasp the puck'", "plan = memory.pop() @ 'lift the puck'"]
+    decoded = lw.decode_plan(ALTERNATIVES.format("\n    ".join(lines)), "push")
+    assert [step.skill for step in decoded.plan.steps] == ["grasp the puck"]
+    notes = "\n".join(map(str, decoded.notes))
+    assert "'lift the puck'" in notes
+    assert "'reach' was not requested; 1 step left out" in notes
+
+
+HOSTILE = {
+    "lists": "[" * 20_000,
+    "closed lists": "[" * 20_000 + "]" * 20_000,
+    "objects": '{"rules": ' * 20_000,
+    "yaml": "\n".join(f"{'  ' * depth}a{depth}:" for depth in range(300)),
+    "references": "a0: &a0 [close the gripper]\n"
+    + "\n".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12)),
+    "names": json.dumps({f"n{number}": [f"n{number + 1}"] * 3 for number in range(3_000)}),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_values_are_read_within_a_second(name):
+    start = process_time()
+    reading = TreeReading(HOSTILE[name])
+    assert reading.error or name in ("yaml", "names")
+    assert process_time() - start < 1.0
+
+
+def test_values_as_models_write_them():
+    assert parse_value('Sure:\n{"a": [1, 2,], // two\n "b": {"c": "d"') == {"a": [1, 2], "b": {"c": "d"}}
+    assert parse_value('{"a": 1}\n{"b": 2}') == [{"a": 1}, {"b": 2}]
+    assert parse_value("{a: 'b', c: [d]}") == {"a": "b", "c": ["d"]}
+    assert parse_value("Here it is.\n\nrules:\n  - if: !open(gripper)\n    then: wait\n\nDone.") == {
+        "rules": [{"if": "!open(gripper)", "then": "wait"}]
+    }
+    assert parse_value("rules:\n  # - {if: a, do: b}\n  - {if: c, do: d}\n") == {"rules": [{"if": "c", "do": "d"}]}
+    assert parse_value("close the gripper") is None
