@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lw_torchrl._util.checks import check_choice, counted, shown, typed
+from lw_torchrl._util.checks import check_choice, shown, typed
 from lw_torchrl.language.expressions import (
     FALSE,
-    TRUE,
     Expression,
     all_of,
     as_expression,
@@ -25,15 +22,12 @@ from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, is_verb, listed_steps
 from lw_torchrl.language.formats.clauses import PATTERNS
 from lw_torchrl.language.formats.clauses import clauses as cut
-from lw_torchrl.language.formats.code import CodeReading
-from lw_torchrl.language.formats.markup import table_rules
+from lw_torchrl.language.formats.detection import read_any, section_notes
 from lw_torchrl.language.formats.prose import ProseReading
-from lw_torchrl.language.formats.python import PythonReading
 from lw_torchrl.language.formats.sentences import SentenceReading
-from lw_torchrl.language.formats.trees import TreeReading
 from lw_torchrl.language.library import expand
-from lw_torchrl.language.nearest import LIMIT, MappedQuery, StepMapper
-from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line, usual_goal
+from lw_torchrl.language.nearest import MappedQuery, StepMapper
+from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line
 from lw_torchrl.language.polarity import instruction
 from lw_torchrl.language.programs import (
     Action,
@@ -42,8 +36,6 @@ from lw_torchrl.language.programs import (
     Done,
     Node,
     ProgramError,
-    actions_of,
-    compile_program,
     tidy,
 )
 from lw_torchrl.language.queries import MOST_CLAUSES, Query
@@ -92,7 +84,6 @@ class DecodedPlan:
         return self.plan is not None and self.scripted is not None and len(self.scripted.steps) == len(self.plan.steps)
 
 
-_MOST_COMPARED = 16  # maximum number of conditions in a guard that is compared with an effect
 # Typographic characters that models write instead of ASCII characters; an empty string deletes the character.
 _PUBLISHED = re.compile(r'^- When [^“”„«]*, (?:the robot should|move the robot)|check\("', re.MULTILINE)
 _TYPOGRAPHY = str.maketrans(
@@ -107,7 +98,6 @@ _CLAUSES = re.compile(
     re.IGNORECASE,
 )
 _SECOND_CONDITION = re.compile(r"(?:if|when|whenever|while|once|unless|as long as) \w", re.IGNORECASE)
-_RESTARTS = ("repeat", "loop", "keep", "continue", "start", "begin", "return")
 _MOST_NOTES = 50  # maximum number of notes on the lines of a text without a plan
 _LONGEST = 65_536  # maximum number of characters to parse
 
@@ -160,7 +150,7 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
     text = text if _PUBLISHED.search(text) else _plain_characters(text)
     if len(text) > _LONGEST:
         notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the remaining {len(text)} characters are not read"))
-    reading, section = _read(text[:_LONGEST], mapper, read)
+    reading, section = read_any(text[:_LONGEST], mapper, read)
     if further := section.clauses[MOST_STEPS:]:
         reading.note(further[0].line, f"the plan has more than {MOST_STEPS} steps; {len(further)} are left out")
         del section.clauses[MOST_STEPS:]
@@ -170,11 +160,11 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
         for clause, words in zip(section.clauses, listed, strict=True)
     ]
     steps = [_mapped(clause, mapper, notes) for clause in clauses]
-    notes += _section_notes(reading, section, owner)
+    notes += section_notes(reading, section, owner)
     if read is None and isinstance(reading, ProseReading | SentenceReading):
         said = [text for clause in clauses for text in (clause.skill, clause.reason)]
-        notes += _unread_actions(text, [*said, *(note.text for note in notes)])
-        notes += _unread_items(text, {clause.line for clause in clauses} | {note.line for note in notes})
+        known = {clause.line for clause in clauses} | {note.line for note in notes}
+        notes += _unread(text, [*said, *(note.text for note in notes)], known)
 
     def plan(skills: Sequence[str | None]) -> ConditionalPlan | None:
         kept = tuple(
@@ -193,25 +183,25 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
     return DecodedPlan(written, scripted, reason, tuple(sorted(notes, key=lambda note: note.line)), tuple(steps))
 
 
-def _unread_actions(text: str, said: Sequence[str]) -> list[Note]:
-    """Return a note for each action in prose whose words appear in neither a step nor another note."""
-    known = [{*re.findall(r"[\w']+", each.lower())} for each in dict.fromkeys(said)]
+def _unread(text: str, said: Sequence[str], known: Collection[int]) -> list[Note]:
+    """Return a note for each action and each item of a list in prose that is in neither a step nor another note.
+
+    Args:
+        said: the texts of the steps and of the notes.
+        known: the numbers of their lines.
+    """
+    words_said = [{*re.findall(r"[\w']+", each.lower())} for each in dict.fromkeys(said)]
     notes = list[Note]()
-    for number, line in enumerate(text.splitlines(), 1):
-        for phrase in (part.strip(" -'") for part in (_CLAUSES.split(line[:8_000]) if known else ())):
+    for number, line in enumerate(text.splitlines(), 1) if known else ():
+        noted = len(notes)
+        for phrase in (part.strip(" -'") for part in _CLAUSES.split(line[:8_000])):
             words = {*re.findall(r"[\w']+", phrase.lower())} - {"the", "a", "it", "there", "first", "only"}
-            if 1 < len(phrase.split()) <= 40 and is_verb(phrase.split()) and not any(words <= each for each in known):
+            is_said = any(words <= each for each in words_said)
+            if 1 < len(phrase.split()) <= 40 and is_verb(phrase.split()) and not is_said:
                 notes.append(Note(number, f"no step has the action {shown(phrase)}"))
-    return notes[:_MOST_NOTES]
-
-
-def _unread_items(text: str, known: Collection[int]) -> list[Note]:
-    """Return a note for each bullet or numbered line outside ``known`` that has neither a condition nor an action."""
-    notes = list[Note]()
-    for number, line in enumerate(text.splitlines(), 1):
-        item = PATTERNS["item"].match(line) if known and number not in known else None
-        words = item[3].split() if item else []
-        if 2 < len(words) <= 40 and words[0].lower() not in _RESTARTS and {c.kind for c in cut(item[3])} == {"say"}:  # type: ignore[index]
+        item = None if number in known or len(notes) > noted else PATTERNS["item"].match(line)
+        is_short = item is not None and 2 < len(item[3].split()) <= 40
+        if item and is_short and not PATTERNS["restarts"].match(item[3]) and {c.kind for c in cut(item[3])} == {"say"}:
             notes.append(Note(number, f"the line is not read: {shown(line.strip())}"))
     return notes[:_MOST_NOTES]
 
@@ -233,7 +223,7 @@ def decode_program(program: str | Node, task: Task, library: Mapping[str, str] |
     mapper = StepMapper(task, None)
 
     def tree(text: str) -> Node:
-        section = _read(text, mapper, None)[1]
+        section = read_any(text, mapper, None)[1]
         if section.tree is not None:
             return section.tree
         return Block(
@@ -252,158 +242,6 @@ def decode_program(program: str | Node, task: Task, library: Mapping[str, str] |
         return Reading([Section("", 1, tree=program)])
 
     return decode_as(" ", read, mapper)
-
-
-def _same(name: str, task: Task) -> bool:
-    """Return whether a name is the task's name, up to case and punctuation."""
-    return re.sub(r"[^a-z0-9]", "", name.lower()) == re.sub(r"[-/]", "", task.name)
-
-
-# Models sometimes answer in a format that was not requested, so every group of readers is tried.
-_GROUPS: tuple[tuple[Callable[[str], Reading], ...], ...] = (
-    (TreeReading,),
-    (PythonReading, CodeReading),
-    (ProseReading, SentenceReading),
-)
-_CONTROL_WORDS = re.compile(r"\b(?:otherwise|or else|else,|unless)\b|\bgo (?:on |back )?to step\b", re.IGNORECASE)
-
-
-_IT = r"(?:when|if|while|once|unless|otherwise,? if) it (?:is|isn't)\b"
-# Lines that are keys in YAML, but begin with a condition about another line, or are sentences after a label.
-_PRONOUN = re.compile(
-    rf"^[ \t]*(?:[-*] )?(?:{_IT}[^:\n]*:|[a-z][\w ]{{0,40}}: (?:the|if|when|unless|once)\b[^\"'{{}}\n]*"
-    r" (?:if|unless|when|once) (?:it|the)\b)",
-    re.IGNORECASE | re.MULTILINE,
-)
-# Conditions about "it": the sentence reader knows what the line before is about.
-_ABOUT_IT = re.compile(rf"^[^\w\n]{{0,20}}(?:\d+[^\w\n]{{1,9}})?{_IT}", re.IGNORECASE | re.MULTILINE)
-
-
-def _read(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) -> tuple[Reading, Section]:
-    """Parse a text with the first group of readers that finds clauses for the task.
-
-    Of this group, return the reading that keeps the most actions, and the section of that reading for the task.
-    """
-    groups = list(_GROUPS if not _PRONOUN.search(text) else reversed(_GROUPS))
-    if read is not None:
-        groups.sort(key=lambda group: read not in group)
-        groups = groups if read in groups[0] else [(read,), *groups]
-    empty = list[tuple[Reading, Section]]()
-    for number, group in enumerate(groups):
-        best = first = _with_clauses(group[0], text, mapper)
-        empty.append(first)
-        is_prose = ProseReading in group
-        own = table_rules(_own_lines(text, first[0], mapper.task)) if is_prose else text
-        is_about_it = _ABOUT_IT.search(own) is not None
-        is_published = bool(first[1].task and first[1].clauses) and not first[0].notes
-        is_free = read is None and is_prose and not (is_published and _CONTROL_WORDS.search(own) is None)
-        # In code with functions for other tasks only, prose is a comment.
-        is_comment = is_prose and any(part.task and part.clauses for pair in empty[:-1] for part in pair[0].sections)
-        if len(group) > 1 and not is_comment and (is_free or _has_control(*first, own)):
-            other = _with_clauses(group[1], own, mapper, any_name=read is None)
-            if group[1] is SentenceReading and all(clause.condition in (TRUE, FALSE) for clause in other[1].clauses):
-                other = first  # prose without any condition is not a plan
-            empty.append(other)
-            known = mapper if is_free else None
-            best = max(
-                first,
-                other,
-                key=lambda pair: (
-                    _kept(pair[1], known),
-                    pair is other and is_about_it,
-                    -len(_section_notes(pair[0], pair[1], mapper.task)),
-                ),
-            )
-        if best[1].clauses:
-            if number and read is not None:
-                best[0].note(best[1].clauses[0].line, "the plan is not in the requested format")
-            return best
-    return next(
-        (pair for pair in empty if pair[0].error), max(empty[:-1] or empty, key=lambda pair: len(pair[0].notes))
-    )
-
-
-def _with_clauses(
-    read: Callable[[str], Reading], text: str, mapper: StepMapper, any_name: bool = False
-) -> tuple[Reading, Section]:
-    """Parse a text and compile the programs for the task; return the reading and the section with the most clauses.
-
-    With ``any_name``, functions that are not named after any task are used if none has the task's name.
-    """
-
-    def effect(skill: str) -> str | None:
-        goal = mapper.query(skill.partition(" until ")[2]) if " until " in skill else None
-        if goal is not None and goal.distance <= LIMIT / 2:
-            return str(goal.query)
-        with suppress(ValueError):
-            words = canonical_skill(skill, mapper.task)
-            query = usual_goal(words, mapper.task) or skill_effect(words, mapper.task)
-            return None if query is None else str(query)
-        return None
-
-    def is_done(guard: Expression, effect: str) -> bool:
-        if len(leaves(guard)) > _MOST_COMPARED:
-            return False
-        mapped = replace_leaves(guard, lambda leaf: _expression(mapper, leaf))
-        return all_of([mapped, negate(_expression(mapper, effect))]) == FALSE
-
-    try:
-        reading = read(text)
-    except (RecursionError, ProgramError) as error:
-        reading = Reading(error=str(error) if isinstance(error, ProgramError) else "the text nests too deeply")
-    own = [section for section in reading.sections if not section.task or _same(section.task, mapper.task)]
-    if any_name and not any(section.clauses or section.tree for section in own):
-        others = [task for task in TASKS.values() if not mapper.task.name.startswith(task.name)]
-        own = [each for each in reading.sections if each.tree and not any(_same(each.task, task) for task in others)]
-        for section in own:
-            reading.note(section.line, f"the function {shown(section.task)} is read as a plan for {mapper.task.name}")
-    for section in own:
-        if section.tree is not None:
-            try:
-                steps = compile_program(
-                    section.tree, effect, lambda text: mapper.query(text).query is not None, is_done
-                )
-            except ProgramError as error:
-                reading.error = str(error)
-                continue
-            pairs = [(step.guard, step.action) for step in steps]
-            section.clauses = [Clause(each.line, guard, one_line(each.text), each.goal) for guard, each in pairs]
-    return reading, max(own or [Section("", 1)], key=_kept)
-
-
-def _expression(mapper: StepMapper, leaf: Any) -> Expression:
-    query = mapper.query(leaf).query if isinstance(leaf, str) else None
-    return as_expression(str(leaf)) if query is None else query.expression
-
-
-def _kept(section: Section, mapper: StepMapper | None = None) -> int:
-    """Return how many clauses of a section can be active; with a mapper, unknown conditions are never true."""
-
-    def can_be_true(each: str | Expression) -> bool:
-        return each != FALSE and not (mapper and isinstance(each, str) and mapper.query(each).query is None)
-
-    return sum(can_be_true(clause.condition) for clause in section.clauses)
-
-
-def _has_control(reading: Reading, section: Section, text: str) -> bool:
-    """Return whether a text may have control flow that the reader of a published format does not understand."""
-    if isinstance(reading, PythonReading):
-        return reading.has_control or not section.clauses
-    return not section.clauses or _CONTROL_WORDS.search(text) is not None
-
-
-def _own_lines(text: str, reading: Reading, task: Task) -> str:
-    """Replace the lines of the sections for other tasks with empty lines."""
-    lines = text.splitlines()
-    for section, end in _ends(reading):
-        if section.task and not _same(section.task, task):
-            lines[section.line - 1 : end - 1] = [""] * len(lines[section.line - 1 : end - 1])
-    return "\n".join(lines)
-
-
-def _ends(reading: Reading) -> list[tuple[Section, int]]:
-    """Return each section with the number of the first line after it."""
-    return [*zip(reading.sections, [*(each.line for each in reading.sections[1:]), sys.maxsize], strict=True)]
 
 
 def _as_skill(goal: str) -> str:
@@ -506,22 +344,6 @@ def _mapped_guard(
     query_as_written = mapper.query(str(guard)).query if isinstance(clause.condition, str) else None
     fits = mapped != FALSE and count_mentions(mapped) <= MOST_CLAUSES
     return query_as_written or (Query(mapped) if fits else None), max(distances), unknown
-
-
-def _section_notes(reading: Reading, section: Section, task: Task) -> list[Note]:
-    """Return the parser's notes on the chosen section, and one note for each other section with clauses."""
-    notes = []
-    for other, end in _ends(reading):
-        is_own = not other.task or _same(other.task, task)
-        if other is section or section.tree is not None or (is_own and not other.clauses):
-            notes += [note for note in reading.notes if other.line <= note.line < end]
-        if other is not section and (
-            steps := len(other.clauses) or (0 if other.tree is None else len([*actions_of(other.tree)]))
-        ):
-            what = "is another version" if _same(other.task, task) else "was not requested"
-            name = repr(other.task) if other.task else "the text before any name"
-            notes.append(Note(other.line, f"{name} {what}; {counted(steps, 'step')} left out"))
-    return notes
 
 
 def _why_none(reading: Reading, steps: list[DecodedStep], task: Task, text: str) -> str:
