@@ -5,8 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import warnings
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
 from typing import Any, TypeAlias
 
 from lw_torchrl._util.checks import shown
@@ -20,6 +19,21 @@ from lw_torchrl.language.formats.base import (
     task_name,
     words_of,
 )
+from lw_torchrl.language.formats.code_values import (
+    Choice,
+    Distance,
+    Name,
+    Text,
+    Value,
+    action,
+    chosen,
+    constant,
+    each_text,
+    joined,
+    leaf,
+    lookup,
+    truth,
+)
 from lw_torchrl.language.formats.phrases import is_noun
 from lw_torchrl.language.formats.python import state_to_reach
 from lw_torchrl.language.programs import (
@@ -30,7 +44,6 @@ from lw_torchrl.language.programs import (
     Label,
     Loop,
     Node,
-    ProgramError,
     actions_of,
     choose,
 )
@@ -39,43 +52,8 @@ PYTHON = PROGRAM_WORDS["python"]
 _RELATIONS = [*PROGRAM_WORDS["prepositions"], "of", "aligned"]  # the last words of relations
 _COMMENTS = PROGRAM_WORDS["keys"]["comment"]
 _MOST_REPAIRS = 8  # maximum number of syntax errors to repair by cutting off code
-_MOST_TEXTS = 64  # maximum number of values of a text that depends on conditions
-_LONGEST = 1_000  # maximum length of a text (characters)
 _MOST_INLINED = 500  # maximum number of inlined calls and unrolled rounds, which bounds the time
 _START = re.compile(r"\s*(?:(?:async\s+)?def|class|if|while|for|import|from|@\w+|[\w.]+\s*[=(])(?!\w)")
-
-
-@dataclass(frozen=True)
-class _Choice:
-    """A string that depends on a condition."""
-
-    condition: Expression
-    then: _Text
-    otherwise: _Text
-    count: int = field(init=False)  # of strings
-
-    def __post_init__(self) -> None:
-        count = sum(each.count if isinstance(each, _Choice) else 1 for each in (self.then, self.otherwise))
-        if count > _MOST_TEXTS:
-            raise ProgramError(f"a string that depends on conditions must have at most {_MOST_TEXTS} possible values")
-        object.__setattr__(self, "count", count)
-
-
-class _Name(str):
-    """The words of a name that the program does not define, such as "puck" for ``env.puck``."""
-
-
-@dataclass(frozen=True)
-class _Distance:
-    """The distance between two objects (in the plane for ``hand[:2] - puck[:2]``), and the relation if it is small."""
-
-    first: _Text
-    second: _Text
-    relation: str
-
-
-_Text: TypeAlias = str | _Choice
-_Value: TypeAlias = "Expression | _Text | _Distance | ast.Lambda | list[_Value] | dict[Any, _Value] | None"
 
 
 class CodeReading(Reading):
@@ -183,7 +161,7 @@ class _Module:
             self.reading.add_tree(task, line, tree)
 
 
-def _reverses(call: ast.Call, text: _Text) -> bool:
+def _reverses(call: ast.Call, text: Text) -> bool:
     """Return whether a call checks the opposite of ``text``: check_not("..."), check("...", expected=False)."""
     last = words_of(_name(call.func))[-1]
     reverses = last in PYTHON["reversed"] and last not in str(text).split()
@@ -197,7 +175,7 @@ def _reverses(call: ast.Call, text: _Text) -> bool:
 class _Scope:
     """The statements of a function, with the values of its variables."""
 
-    def __init__(self, module: _Module, values: dict[str, _Value], roots: Collection[str] = (), end: str = "") -> None:
+    def __init__(self, module: _Module, values: dict[str, Value], roots: Collection[str] = (), end: str = "") -> None:
         self.module, self.values, self.roots = module, values, roots
         self.end = end  # the label after the inlined function; "" for a function that is not inlined
 
@@ -212,7 +190,7 @@ class _Scope:
     def block(self, body: Sequence[ast.stmt]) -> Block:
         return Block(tuple(part for statement in body for part in self.statement(statement)))
 
-    def branch(self, body: Sequence[ast.stmt]) -> tuple[Block, dict[str, _Value]]:
+    def branch(self, body: Sequence[ast.stmt]) -> tuple[Block, dict[str, Value]]:
         """Return the tree of a branch, and the values of the variables after the branch."""
         before = dict(self.values)
         node, after = self.block(body), self.values
@@ -279,7 +257,7 @@ class _Scope:
         for condition, body, values in reversed(branches):
             for name, then in values.items():
                 if (other := self.values.get(name)) is not then:
-                    self.values[name] = _chosen(condition, then, other)
+                    self.values[name] = chosen(condition, then, other)
             result = Branch(condition, body, result)
         return result or Block()
 
@@ -348,9 +326,9 @@ class _Scope:
             case ast.Call() if name := self.module.helper(node):
                 return self.inline(node, name)
             case ast.Call(keywords=named) if guards := [each for each in named if each.arg in PYTHON["guards"]]:
-                action = ast.copy_location(ast.Call(node.func, node.args, [x for x in named if x not in guards]), node)
+                bare = ast.copy_location(ast.Call(node.func, node.args, [x for x in named if x not in guards]), node)
                 tests = [self.guard(str(each.arg), each.value) for each in guards]
-                return [Branch(all_of(tests), Block(tuple(self.expression(action, is_returned))))]
+                return [Branch(all_of(tests), Block(tuple(self.expression(bare, is_returned))))]
             case ast.Call(func=function) if isinstance(known := self.value(function), ast.Lambda) and self.count(1):
                 return self.expression(known.body, is_returned)
             case ast.Call(func=ast.Attribute(value=owner, attr="get")) if isinstance(self.value(owner), dict):
@@ -358,15 +336,15 @@ class _Scope:
             case ast.Call():
                 return self.call(node)
         text = self.words(node) if is_returned else None
-        return [] if text is None or isinstance(text, _Name) else [_action(text, node.lineno)]
+        return [] if text is None or isinstance(text, Name) else [action(text, node.lineno)]
 
     def first(self, values: Sequence[ast.expr]) -> Node:
         """Return the first action of "grasp(...) or lift(...) or 'wait'": a helper that returns None is passed over."""
         result: Node = Block()
         for each in reversed(values):
             text = self.value(each)
-            if isinstance(text, str | _Choice) and not isinstance(text, _Name):
-                result = _action(text, each.lineno, otherwise=result)
+            if isinstance(text, str | Choice) and not isinstance(text, Name):
+                result = action(text, each.lineno, otherwise=result)
             elif isinstance(text, Expression) and (not isinstance(each, ast.Call) or _is_check(each)):
                 result = Branch(negate(text), result)  # "check(...) or robot.grasp(...)"
             else:
@@ -390,12 +368,12 @@ class _Scope:
             skill, goal = state_to_reach(place, flags | texts)
             return [Action(skill, node.lineno, goal)]
         goal = str(named.pop("goal", ""))
-        parts: list[_Text] = [verb[0], receiver, " ".join(verb[1:]), *words]
+        parts: list[Text] = [verb[0], receiver, " ".join(verb[1:]), *words]
         for name, text in named.items():
             if name in _COMMENTS:
                 continue
             parts += [name.rstrip("_"), text] if name.rstrip("_") in PROGRAM_WORDS["prepositions"] else [text]
-        return [_action(_joined(parts), node.lineno, goal)]
+        return [action(joined(parts), node.lineno, goal)]
 
     def is_action(self, node: ast.Call) -> bool:
         """Return whether a call is a skill: a method of the robot, or a function whose first word is a verb."""
@@ -403,11 +381,11 @@ class _Scope:
         is_skill = is_verb(words_of(_name(node.func))[:1])
         return _is_carrier(node) or (root in PYTHON["robots"] or (is_skill and _is_owner(root)) if dot else is_skill)
 
-    def receiver(self, node: ast.expr) -> _Text:
+    def receiver(self, node: ast.expr) -> Text:
         """Return the words before a method's name, without the robot: "gripper" in ``robot.gripper.close()``."""
         return (self.words(node.value) or "") if isinstance(node, ast.Attribute) else ""
 
-    def arguments(self, node: ast.Call) -> tuple[list[_Text], dict[str, _Text]]:
+    def arguments(self, node: ast.Call) -> tuple[list[Text], dict[str, Text]]:
         """Return the words of a call's arguments and of its keyword arguments."""
         words = [text for each in node.args if (text := self.words(each)) is not None]
         pairs = [(each.arg, self.words(each.value)) for each in node.keywords if each.arg]
@@ -440,23 +418,23 @@ class _Scope:
 
     # Values
 
-    def words(self, node: ast.expr) -> _Text | None:
+    def words(self, node: ast.expr) -> Text | None:
         """Return the text of an expression; None for an expression without words, such as a number."""
         value = self.value(node)
-        return value if isinstance(value, str | _Choice) else None
+        return value if isinstance(value, str | Choice) else None
 
     def condition(self, node: ast.expr) -> Expression:
         """Convert an expression to a condition. Code that cannot be converted becomes a leaf with the source text."""
         value = self.value(node)
-        return _truth(value) if isinstance(value, Expression | str | _Choice) else as_expression(ast.unparse(node))
+        return truth(value) if isinstance(value, Expression | str | Choice) else as_expression(ast.unparse(node))
 
-    def value(self, node: ast.expr) -> _Value:
+    def value(self, node: ast.expr) -> Value:
         """Return the value of an expression; None if it has no meaning in a plan."""
         match node:
             case ast.Await(value=value) | ast.FormattedValue(value=value):
                 return self.value(value)
             case ast.Constant(value=value):
-                return value if isinstance(value, str) else "" if value is None else _constant(value)
+                return value if isinstance(value, str) else "" if value is None else constant(value)
             case ast.Lambda():
                 return node
             case ast.List(elts=parts) | ast.Tuple(elts=parts) | ast.Set(elts=parts):
@@ -465,20 +443,20 @@ class _Scope:
                 return {self.key(key): self.value(each) for key, each in zip(keys, values, strict=True) if key}
             case ast.Name(id=name):
                 unknown = PYTHON["names"].get(name) or " ".join(words_of(name))
-                return self.values[name] if name in self.values else None if _is_owner(name) else _Name(unknown)
+                return self.values[name] if name in self.values else None if _is_owner(name) else Name(unknown)
             case ast.Attribute() | ast.Subscript():
                 return self.part(node)
             case ast.Call():
                 return self.result(node)
             case ast.JoinedStr(values=values):
-                return _joined([text for each in values if (text := self.words(each)) is not None], "")
+                return joined([text for each in values if (text := self.words(each)) is not None], "")
             case ast.BinOp(left=left, op=ast.Add(), right=right):
                 texts = [text for each in (left, right) if (text := self.words(each)) is not None]
-                return _joined(texts, "") if len(texts) == 2 else None
+                return joined(texts, "") if len(texts) == 2 else None
             case ast.IfExp(test=test, body=body, orelse=orelse):
                 then, otherwise = self.words(body), self.words(orelse)
                 if then is not None and otherwise is not None:
-                    return _Choice(self.condition(test), then, otherwise)
+                    return Choice(self.condition(test), then, otherwise)
                 return choose(*map(self.condition, (test, body, orelse)))
             case ast.NamedExpr(target=ast.Name(id=name), value=value):
                 self.values[name] = self.value(value)
@@ -501,13 +479,13 @@ class _Scope:
         """Return the value of a key in a table."""
         return node.value if isinstance(node, ast.Constant) else self.words(node)
 
-    def part(self, node: ast.Attribute | ast.Subscript) -> _Value:
+    def part(self, node: ast.Attribute | ast.Subscript) -> Value:
         """Return an entry of a table or record, the value of a property, or else the words of ``puck.position``."""
         owner = self.value(node.value)
         if isinstance(node, ast.Subscript):
             if isinstance(node.slice, ast.Slice):
                 return owner
-            return _lookup(owner, self.key(node.slice)) if isinstance(owner, dict) else self.value(node.slice)
+            return lookup(owner, self.key(node.slice)) if isinstance(owner, dict) else self.value(node.slice)
         if isinstance(owner, dict) and node.attr in owner:
             return owner[node.attr]
         if self.module.helper(call := ast.copy_location(ast.Call(node, [], []), node)):
@@ -515,10 +493,10 @@ class _Scope:
         if _name(node.value) in ("self", *self.module.fields) and node.attr in self.module.constants.values:
             return self.values.get(node.attr)
         is_named = node.attr not in PYTHON["fields"] and not _is_owner(node.attr)
-        words = _joined([self.receiver(node), " ".join(words_of(node.attr)) if is_named else ""])
-        return _Name(words) if words and isinstance(words, str) else words or None
+        words = joined([self.receiver(node), " ".join(words_of(node.attr)) if is_named else ""])
+        return Name(words) if words and isinstance(words, str) else words or None
 
-    def result(self, node: ast.Call) -> _Value:
+    def result(self, node: ast.Call) -> Value:
         """Return the result of a call: of a helper, a function of Python, a table's ``get``, or a question."""
         if name := self.module.helper(node):
             return self.called(node, name)
@@ -535,26 +513,26 @@ class _Scope:
             case ast.Call(func=ast.Attribute(value=owner, attr="get"), args=[key, *default]) if isinstance(
                 table := self.value(owner), dict
             ):
-                return _lookup(table, self.key(key), self.value(default[0]) if default else None)
+                return lookup(table, self.key(key), self.value(default[0]) if default else None)
             case ast.Call(func=ast.Attribute(attr="norm"), args=[ast.BinOp(left=left, op=ast.Sub(), right=right)]):
                 return self.distance(left, right)
             case ast.Call(args=[left, right]) if {"dist", "distance"} & {*words_of(_name(node.func))}:
                 return self.distance(left, right)
             case ast.Call(args=[argument, *_]) if words_of(_name(node.func))[:1] in (["get"], ["find"], ["object"]):
                 text = self.words(argument)
-                return _Name(text) if isinstance(text, str) else text
+                return Name(text) if isinstance(text, str) else text
             case ast.Call(func=function, args=args) if isinstance(called := self.value(function), ast.Lambda):
                 inner = {each.arg: self.value(value) for each, value in zip(called.args.args, args, strict=False)}
                 return _Scope(self.module, self.values | inner).value(called.body) if self.count(1) else FALSE
         if (text := self.question(node)) is None:
             return None
-        return negate(_leaf(text)) if _reverses(node, text) else _leaf(text)
+        return negate(leaf(text)) if _reverses(node, text) else leaf(text)
 
-    def distance(self, *nodes: ast.expr) -> _Distance | None:
+    def distance(self, *nodes: ast.expr) -> Distance | None:
         pair = [self.words(each) for each in nodes]
         is_flat = all(isinstance(each, ast.Subscript) and ast.unparse(each.slice) == ":2" for each in nodes)
         relation = "vertically aligned with" if is_flat else "near"
-        return _Distance(*pair, relation) if all(pair) else None  # type: ignore[arg-type, call-arg]
+        return Distance(*pair, relation) if all(pair) else None  # type: ignore[arg-type, call-arg]
 
     def comparison(self, node: ast.Compare, left: ast.expr, op: ast.cmpop, right: ast.expr) -> Expression | None:
         """Convert a comparison with a truth value, a threshold, or the text of a variable to a condition."""
@@ -564,24 +542,24 @@ class _Scope:
         )
         value, other = self.value(left), self.value(right)
         condition: Expression | None = None
-        truth = right.value if isinstance(right, ast.Constant) else None
-        if is_equality and (isinstance(truth, bool) or (truth in (0, 1) and isinstance(left, ast.Call))):
+        number = right.value if isinstance(right, ast.Constant) else None
+        if is_equality and (isinstance(number, bool) or (number in (0, 1) and isinstance(left, ast.Call))):
             condition = self.condition(left)
-            differs ^= not truth  # int(check("...")) == 0
-        elif isinstance(op, ast.Lt) and truth == 1 and isinstance(value, Expression):
+            differs ^= not number  # int(check("...")) == 0
+        elif isinstance(op, ast.Lt) and number == 1 and isinstance(value, Expression):
             condition, differs = value, True
-        elif isinstance(value, _Distance):
+        elif isinstance(value, Distance):
             condition, differs = (
-                _leaf(_joined([value.first, value.relation, value.second])),
+                leaf(joined([value.first, value.relation, value.second])),
                 not isinstance(op, ast.Lt | ast.LtE),
             )
             self.note(node, f"the threshold in {shown(ast.unparse(node))} is read as that of {value.relation!r}")
-        elif isinstance(value, _Choice | str) and isinstance(other, _Choice | str):
-            is_known = isinstance(value, _Choice) or (ast.unparse(right) == "None" and not isinstance(value, _Name))
+        elif isinstance(value, Choice | str) and isinstance(other, Choice | str):
+            is_known = isinstance(value, Choice) or (ast.unparse(right) == "None" and not isinstance(value, Name))
             if is_known and isinstance(other, str):
-                condition = _each(value, lambda each: TRUE if each == other else FALSE, choose)
+                condition = each_text(value, lambda each: TRUE if each == other else FALSE, choose)
             elif is_equality and ast.unparse(right) != "None":
-                condition = _leaf(_joined([value, "is", other]))
+                condition = leaf(joined([value, "is", other]))
         return condition if condition is None or not differs else negate(condition)
 
     def guard(self, word: str, test: ast.expr) -> Expression:
@@ -597,24 +575,24 @@ class _Scope:
                 scopes = (_Scope(self.module, self.values | {loop.target.id: each}) for each in items)
                 return [scope.condition(node.elt) for scope in scopes]
         items = self.value(node)
-        return [*map(_truth, items)] if isinstance(items, list) else [self.condition(node)]
+        return [*map(truth, items)] if isinstance(items, list) else [self.condition(node)]
 
-    def question(self, node: ast.Call) -> _Text | None:
+    def question(self, node: ast.Call) -> Text | None:
         """Return the words of a call in a condition: "gripper is above puck" for ``gripper.is_above(puck)``."""
         words, named = self.arguments(node)
         manner = [text for name, text in named.items() if name in PYTHON["manners"]]
         words += [text for name, text in named.items() if name not in PYTHON["manners"]]
         is_sentence = len(words) > 2 or any(isinstance(each, str) and len(each.split()) > 3 for each in words)
         if words and (_is_check(node) or is_sentence):
-            return _joined(words)
+            return joined(words)
         receiver, name = self.receiver(node.func), words_of(_name(node.func))
         if words and name[-1] not in _RELATIONS and not is_noun(str(receiver)) and is_noun(str(words[0])):
             receiver = ""  # "vision.is_closed(gripper)"
         if len(words) > 1 or (words and not receiver and name[-1:] != ["holding"] and name[-1] not in _RELATIONS):
             receiver, *words = words
-        return _joined([receiver, *manner, " ".join(name), *words]) or None
+        return joined([receiver, *manner, " ".join(name), *words]) or None
 
-    def called(self, node: ast.Call, name: str) -> _Value:
+    def called(self, node: ast.Call, name: str) -> Value:
         """Return the value that a helper function returns."""
         if (scope := self.inner(node, name)) is None:
             return as_expression(ast.unparse(node))
@@ -623,7 +601,7 @@ class _Scope:
         self.module.stack.pop()
         return returned
 
-    def returned(self, body: Sequence[ast.stmt]) -> _Value:
+    def returned(self, body: Sequence[ast.stmt]) -> Value:
         """Return the value that the statements of a function return."""
         for number, statement in enumerate(body):
             match statement:
@@ -635,7 +613,7 @@ class _Scope:
                     branches = [(test, scope.returned([*then, *rest])) for test, then, scope in scopes]
                     returned = self.returned([*otherwise, *rest])
                     for test, then in reversed(branches):
-                        returned = _chosen(test, then, returned)
+                        returned = chosen(test, then, returned)
                     return returned
                 case (
                     ast.Assign(targets=[ast.Name(id=name)], value=value)
@@ -665,67 +643,3 @@ def _is_check(node: ast.Call) -> bool:
     words = words_of(_name(node.func))
     words = words[:-1] if len(words) > 1 and words[-1] in PYTHON["reversed"] else words
     return " ".join(words) in PYTHON["checks"]
-
-
-def _joined(parts: Sequence[_Text], gap: str = " ") -> _Text:
-    """Join texts; a text that depends on a condition makes the result depend on it."""
-    for number, part in enumerate(parts):
-        if isinstance(part, _Choice):
-            both = (_joined([*parts[:number], each, *parts[number + 1 :]], gap) for each in (part.then, part.otherwise))
-            return _Choice(part.condition, *both)
-    if sum(map(len, parts)) > _LONGEST:  # type: ignore[arg-type]
-        raise ProgramError(f"a text must have at most {_LONGEST} characters")
-    return gap.join(str(part) for part in parts if part != "")
-
-
-def _each(text: _Text, function: Callable[[str], Any], join: Callable[[Expression, Any, Any], Any]) -> Any:
-    """Apply a function to each string that a text can be, and join the results by the conditions."""
-    if isinstance(text, _Choice):
-        return join(text.condition, *(_each(part, function, join) for part in (text.then, text.otherwise)))
-    return function(text)
-
-
-def _lookup(table: dict[Any, _Value], key: Any, default: _Value = None) -> _Value:
-    """Return the entry of a table at a key that may depend on conditions."""
-
-    def join(condition: Expression, then: _Value, otherwise: _Value) -> _Value:
-        return _chosen(condition, then or "", otherwise or "")
-
-    return _each(key, lambda each: table.get(each, default), join)
-
-
-def _leaf(text: _Text) -> Expression:
-    """Return the condition that a text states."""
-    return _each(text, lambda words: as_expression(" ".join(words.split())) if words else FALSE, choose)
-
-
-def _action(text: _Text, line: int, goal: str = "", otherwise: Node = Block()) -> Node:  # noqa: B008
-    """Return the action that a text states; ``otherwise`` where the text is empty."""
-
-    def action(words: str) -> Node:
-        return Action(" ".join(words.split()), line, goal) if words or goal else otherwise
-
-    return _each(text, action, Branch)
-
-
-def _truth(value: _Value) -> Expression:
-    """Convert a value to a condition."""
-    return _leaf(value) if isinstance(value, str | _Choice) else value if isinstance(value, Expression) else FALSE
-
-
-def _constant(value: object) -> Expression | None:
-    return None if not isinstance(value, int) else TRUE if value else FALSE
-
-
-def _chosen(condition: Expression, then: _Value, otherwise: _Value) -> _Value:
-    """Return the value of a variable after a branch."""
-    # A function that returns a text only in one branch returns None, an empty text, in the other.
-    then, otherwise = (
-        "" if one == FALSE and isinstance(other, str | _Choice) else one
-        for one, other in ((then, otherwise), (otherwise, then))
-    )
-    if isinstance(then, Expression) or isinstance(otherwise, Expression):
-        return then if otherwise is None else choose(condition, _truth(then), _truth(otherwise))
-    if isinstance(then, str | _Choice) and isinstance(otherwise, str | _Choice) and then != otherwise:
-        return _Choice(condition, then, otherwise)
-    return then

@@ -18,6 +18,20 @@ from lw_torchrl._util.checks import shown
 from lw_torchrl.language.connectives import parse_words
 from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, as_expression, negate
 from lw_torchrl.language.formats.base import PROGRAM_WORDS, Reading, code_blocks, command, in_turn, statement, words_of
+from lw_torchrl.language.formats.fields import (
+    is_always,
+    is_answer,
+    is_facts,
+    is_goal,
+    is_machine,
+    is_program,
+    is_reserved,
+    is_skipped,
+    is_test,
+    named,
+    source,
+    transitions_of,
+)
 from lw_torchrl.language.formats.phrases import (
     ROLES,
     STRUCTURE,
@@ -62,7 +76,6 @@ from lw_torchrl.language.programs import (
     is_condition,
 )
 from lw_torchrl.language.queries import split_words
-from lw_torchrl.language.relations import PREDICATES
 
 _TYPES = {word: kind for kind, words in PROGRAM_WORDS["types"].items() for word in words}
 _JOINS = ("selector", "sequence", "not", "memory")
@@ -117,20 +130,20 @@ class _Tree:
     def define(self, value: Any, unused: Collection[str]) -> None:
         """Find the programs and conditions that a text defines by name, which are read where they are named."""
         tables = [each for _, each in values_in(value) if isinstance(each, dict | list)]
-        self.has_edges = any(map(_edges, tables))
+        self.has_edges = any(map(transitions_of, tables))
         counts, fields = _counts(value), Counter(texts_in(value))
         for table in tables:
             rows = [row for row in table if isinstance(row, dict)]
-            if len(rows) > 1 and all(any(map(_is_goal, row)) for row in rows):
-                self.subgoals |= {id(row) for row in rows if not any(_is_test(*pair) for pair in row.items())}
+            if len(rows) > 1 and all(any(map(is_goal, row)) for row in rows):
+                self.subgoals |= {id(row) for row in rows if not any(is_test(*pair) for pair in row.items())}
             keys = [*table] if isinstance(table, dict) else [*range(len(table))]
             names = [*map(str, keys)] if isinstance(table, dict) else names_of(table, counts, fields)
-            if self.has_edges and len({*names}) > 1 and _is_machine([table[key] for key in keys], {*names}):
+            if self.has_edges and len({*names}) > 1 and is_machine([table[key] for key in keys], {*names}):
                 continue
             found = {
                 name: key
                 for name, key in zip(names, keys, strict=True)
-                if name not in unused and not _is_reserved(name, table[key])
+                if name not in unused and not is_reserved(name, table[key])
                 if counts[name] > _counts([table[key]])[name]
             }
             inside = _counts(table) if len(found) > 1 else counts
@@ -189,7 +202,7 @@ class _Tree:
             node = self.node(self.definitions[text], hint)
             self.opened.pop()
             return node
-        if (_is_always(text) and hint != "act") or (hint == "test" and truth_of(text) is not None):
+        if (is_always(text) and hint != "act") or (hint == "test" and truth_of(text) is not None):
             return Check(FALSE if truth_of(text) is False else TRUE)
         if hint != "test" and text[:1] == "!" and "(" not in text and is_command(text[1:]):  # marks an action
             return self.leaf(text[1:].strip(), "act")
@@ -203,9 +216,9 @@ class _Tree:
             return Check(self.said(text))
         if call := re.fullmatch(r"(?:\w+\.)?([A-Za-z]\w*)\((.*)\)", text):
             arguments = [each.strip(" '\"").partition("=") for each in call[2].split(",") if each.strip()]
-            named = {key.strip(): each.strip(" '\"") for key, sign, each in arguments if sign}
+            by_name = {key.strip(): each.strip(" '\"") for key, sign, each in arguments if sign}
             unnamed = [each for each, sign, _ in arguments if not sign]
-            value = {"call": call[1], "of": unnamed, **named} if named else [call[1], *unnamed]
+            value = {"call": call[1], "of": unnamed, **by_name} if by_name else [call[1], *unnamed]
             if (phrase := self.phrase(value, hint)) is not None:
                 return phrase
             text = f"{call[1]}({call[2]})"
@@ -219,7 +232,7 @@ class _Tree:
         if self.is_defined(text):
             return _condition(self.leaf(text, "test"))
         words = split_words(statement(text))
-        if _is_always(text):
+        if is_always(text):
             return TRUE
         if not {*words} & self.definitions.keys() - {*self.opened}:
             return as_expression(statement(text))
@@ -299,9 +312,9 @@ class _Tree:
                 break
             if role in ("not", "truth") and truth is not None:
                 negated ^= truth == (role == "not")
-            elif (id(row), name) in self.hidden or _is_skipped(row, key, value):
+            elif (id(row), name) in self.hidden or is_skipped(row, key, value):
                 continue
-            elif id(row) in self.subgoals and _is_goal(name) and states(value):
+            elif id(row) in self.subgoals and is_goal(name) and states(value):
                 fields["until"] = value
             elif role == "memory" and not isinstance(value, dict | list):
                 memory = bool(truth)
@@ -317,7 +330,7 @@ class _Tree:
                 kind = kind or _TYPES.get(text) or _TYPES.get(text.split()[-1], "")
                 if is_predicate(text) or is_comparator(value):
                     fields[key] = value  # {"op": "near", ...}
-            elif isinstance(value, dict) and role in ("", "selector") and _is_answer(value) and not is_statement(key):
+            elif isinstance(value, dict) and role in ("", "selector") and is_answer(value) and not is_statement(key):
                 fields |= {str(inner): each for inner, each in value.items()}  # {"switch": ..., "cases": {"true": ...}}
             else:
                 fields[key] = value
@@ -347,7 +360,7 @@ class _Tree:
         free = {key: value for key, value in fields.items() if role_of(key) not in STRUCTURE[:5]}
         has_act = any(role_of(key) == "act" for key in free)
         if has_act:
-            free = {key: value for key, value in free.items() if role_of(key) or not value or not _is_facts(value)}
+            free = {key: value for key, value in free.items() if role_of(key) or not value or not is_facts(value)}
         is_whole = hint != "test" or len(free) == len(fields)
         if not join and is_whole and (node := self.phrase(free, hint or ("act" if has_act else ""))) is not None:
             fields = {key: value for key, value in fields.items() if key not in free}
@@ -355,7 +368,7 @@ class _Tree:
                 tests.append(_condition(node))
             else:
                 bodies.append(node)
-        fields = {key: value for key, value in fields.items() if role_of(key) not in _LABELS or _is_program(key, value)}
+        fields = {key: value for key, value in fields.items() if role_of(key) not in _LABELS or is_program(key, value)}
         if any(isinstance(value, dict | list) and has_action(value) for value in fields.values()):
             has_test = any(role_of(key) in STRUCTURE[:4] for key in fields)
             texts = {key: value for key, value in fields.items() if role_of(key) == "" and isinstance(value, str)}
@@ -428,7 +441,7 @@ class _Tree:
             is_children = isinstance(value, dict) and role != "not"
             children = value if is_children else {"children": value if isinstance(value, list) else [value]}
             return self.object({"type": role, **children}, hint)
-        if role == "" and _is_facts({key: value}):
+        if role == "" and is_facts({key: value}):
             return self.phrase({key: value}, "test")
         if join and isinstance(value, list) and role != "act":
             return self.listed(value, hint, join)
@@ -439,13 +452,13 @@ class _Tree:
         while no condition that leads back is. A plan has no memory, so the state that was active before is unknown.
         """
         tables = {str(key): value for key, value in row.items() if isinstance(value, dict | list)}
-        outside = [*_edges(tables).values()]
+        outside = [*transitions_of(tables).values()]
         for table in [*tables.values(), row]:
-            pairs = table.items() if isinstance(table, dict) else [(_named(each), each) for each in table]
+            pairs = table.items() if isinstance(table, dict) else [(named(each), each) for each in table]
             states = {str(name): each for name, each in pairs}
             edges = [value for value in outside if value is not table]
             is_led = any(text in states for _, text in texts_in(edges))
-            if len(states) > 1 and (is_led or _is_machine([*states.values()], {*states})):
+            if len(states) > 1 and (is_led or is_machine([*states.values()], {*states})):
                 break
         else:
             return None
@@ -458,7 +471,7 @@ class _Tree:
             nodes[name] = self.object({key: value for key, value in fields.items() if key not in skipped}, "")
             leading: list[Any] = [{key: value} for key, value in fields.items() if key in led]
             for rows in edges:
-                leading.append(rows.get(name) if isinstance(rows, dict) else [x for x in rows if _source(x) == name])
+                leading.append(rows.get(name) if isinstance(rows, dict) else [x for x in rows if source(x) == name])
             done = all_of(until or [Done(action.text) for action in actions_of(nodes[name])])
             exits[name] = [pair for each in leading for pair in self.exits(each, states, done)]
         start = next((str(value) for key, value in row.items() if role_of(str(key)) == "start"), "")
@@ -485,10 +498,10 @@ class _Tree:
         parts = [(str(key), each) for key, each in parts if str(key) not in ("from", "source")]
         if isinstance(value, list) and len(value) == 3 and mentions(value[0], states):
             parts = parts[1:]  # [state, condition, next state]
-        named = [each for key, each in parts if isinstance(each, str) and each in states and role_of(key) != "name"]
-        others = [each for _, each in parts if isinstance(each, str | dict | list) and each not in named]
-        if len(named) == 1 and others and not any(mentions(each, states) for each in others):
-            return [(all_of(map(self.condition, others)), named[0])]
+        targets = [each for key, each in parts if isinstance(each, str) and each in states and role_of(key) != "name"]
+        others = [each for _, each in parts if isinstance(each, str | dict | list) and each not in targets]
+        if len(targets) == 1 and others and not any(mentions(each, states) for each in others):
+            return [(all_of(map(self.condition, others)), targets[0])]
         pairs = list[tuple[Expression, str]]()
         for key, each in parts:
             if key in states:
@@ -510,85 +523,6 @@ def _sections(text: str) -> list[tuple[int, str | list[str]]]:
         if any(len(said & each) > 1 for other, each in enumerate(names) if other != number):
             return [(0, [block for (_, block), value in zip(blocks, found, strict=True) if value is not None])]
     return [*blocks]
-
-
-def _edges(value: Any) -> dict[Any, Any]:
-    """Return the fields of an object that hold transitions between states."""
-    rows = value.items() if isinstance(value, dict) else ()
-    return {key: each for key, each in rows if role_of(str(key)) == "transitions"}
-
-
-def _is_facts(value: Any) -> bool:
-    """Return whether an object states facts: {"near": ["gripper", "mug"], "gripper": "closed"}."""
-    return isinstance(value, dict) and all(
-        (is_noun(str(key)) and (isinstance(each, dict) or is_predicate(str(each))))
-        or (is_predicate(str(key)) and isinstance(each, list) and len(each) > 1)
-        for key, each in value.items()
-    )
-
-
-def _is_goal(key: Any) -> bool:
-    return plain(str(key)).rpartition(" ")[2] in PROGRAM_WORDS["prose"]["goals"]
-
-
-def _is_test(key: Any, value: Any) -> bool:
-    role = role_of(str(key))
-    return role == "test" or (role not in ("name", "comment", "act") and states(value) and not has_action(value))
-
-
-def _is_program(key: str, value: Any) -> bool:
-    """Return whether the value of a label is a program: {"task": {"if": ..., "then": ...}}."""
-    if isinstance(value, dict) and role_of(key) != "comment":
-        return True
-    rows = [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []
-    return any(has_action(row) and any(role_of(str(key)) in STRUCTURE for key in row) for row in rows)
-
-
-def _is_always(text: str) -> bool:
-    return text.lower().strip(" .") in PROGRAM_WORDS["always"]
-
-
-def _is_machine(members: list[Any], names: Collection[str]) -> bool:
-    """Return whether a transition in a table's members leads to one of the members' names."""
-    return any(mentions(value, names) for each in members for value in _edges(each).values()) or any(
-        text in names and (role_of(key) == "transitions" or is_statement(key)) for key, text in texts_in(members)
-    )
-
-
-def _named(value: Any) -> str:
-    """Return the name that an object gives itself: {"id": "grasp"}."""
-    rows = value.items() if isinstance(value, dict) else ()
-    return next((str(each) for key, each in rows if plain(str(key)) in ("id", "name", "key", "state")), "")
-
-
-def _source(value: Any) -> str:
-    """Return the name of the state that a transition leaves."""
-    if isinstance(value, dict):
-        return str(value.get("from", value.get("source", _named(value))))
-    return str(value[0]) if isinstance(value, list) and value else ""
-
-
-def _is_reserved(name: str, value: Any) -> bool:
-    """Return whether a name has another meaning than its definition."""
-    is_word = plain(name) in ROLES or _is_always(name)
-    is_object = is_noun(name) and not any(is_told(text) for _, text in texts_in(value))
-    is_relation = plain(name) in PREDICATES and not (isinstance(value, str) and is_told(value))
-    return not name or is_word or is_object or is_relation
-
-
-def _is_skipped(row: dict[Any, Any], key: str, value: Any) -> bool:
-    """Return whether a field can be ignored: {"else": true}, or definitions, which are read where they are named."""
-    if value is None:
-        return not is_command(key)
-    role = role_of(key)
-    is_named = isinstance(value, list) and all(isinstance(each, str) for each in value)  # names of definitions
-    return (role == "definitions" and len(row) > 1 and not is_named) or (role == "else" and truth_of(value) is not None)
-
-
-def _is_answer(row: dict[Any, Any]) -> bool:
-    """Return whether an object contains the branches of a separate condition: {"true": ..., "false": ...}."""
-    roles = {role_of(str(key)) for key in row}
-    return "else" in roles and roles <= {"act", "else"}
 
 
 def _counts(value: Any) -> Counter[str]:
