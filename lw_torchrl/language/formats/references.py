@@ -97,7 +97,7 @@ class References:
             is_hand = PATTERNS["hand"].fullmatch(subject) or not self.subject
             subject = "the gripper" if is_hand else self.subject
         if relation is None:
-            if copula is None or part[copula.end() :].strip(" not"):
+            if copula is None or part[copula.end() :].strip() not in ("", "not"):
                 return part
             self.subject = subject  # "the gripper is neither ... nor ..."
             return "not" if re.search(r"\bnot\b|n't", part) else ""
