@@ -14,6 +14,7 @@ from rapidfuzz import fuzz, process
 from lw_torchrl._util.checks import check_choice, typed
 from lw_torchrl.language.connectives import parse_words
 from lw_torchrl.language.expressions import Expression
+from lw_torchrl.language.mentions import mentions
 from lw_torchrl.language.objects import GRIPPER, WORDS
 from lw_torchrl.language.polarity import affirmed, agree, instruction, plain_negations, poles, rests, source_of
 from lw_torchrl.language.queries import (
@@ -24,10 +25,10 @@ from lw_torchrl.language.queries import (
     read_query,
     split_words,
 )
-from lw_torchrl.language.relations import PREDICATES, STATES, TOUCHING
-from lw_torchrl.language.roles import has_certain_target, mark_objects
+from lw_torchrl.language.relations import PREDICATES, RELATIONS, STATES, TOUCHING
+from lw_torchrl.language.roles import has_certain_target
 from lw_torchrl.language.skills import ScriptedSkill, SkillError, Skills, load_skills, skills_for
-from lw_torchrl.language.tasks import Task, get_task, same_object
+from lw_torchrl.language.tasks import Task, get_task
 from lw_torchrl.language.text import sentence_vectors
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ class QueryPart(NamedTuple):
     text: str
     query: Query
     score: float
+    is_certain: bool = True  # whether the query has the relation and the objects that the text names
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ def _nearest_match(words: list[str], task: Task, by: str) -> QueryMatch | None:
             match = _nearest_part(part, task, by)
             if subject and match.score < 1.0:
                 joined = _nearest_part(f"the {subject} {part}", task, by)
-                match = joined._replace(text=part) if joined.score > match.score else match
+                match = joined._replace(text=part) if joined[2:] > match[2:] else match
             known[part, subject] = match
         parts.append(known[part, subject])
         subject = next((clause.subject for clause in parts[-1].query.clauses), subject)
@@ -161,18 +163,25 @@ def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
     words, negated, is_read = affirmed(part)
     clauses, contents = _choices(task, tuple(PREDICATES))
     written = poles(words)
+    nouns = mentions(" ".join(words[:_LONGEST]), task)
     if not any(name in _HANDS for name in task.object_names):
         words = _A_HAND.sub("gripper", " ".join(words)).split()
-    subject = re.match(r"(?:is )?<([^>]*)> \w", mark_objects(" ".join(words[:_MOST_CLAUSES]), task))
-    name = subject[1] if subject and subject[1] in task.object_names else None
-    others = {other for other in task.object_names if name is not None and not same_object(task, name, other)}
-    unstated = _unstated(words, by)
+    stated = _stated(words) if by == "edit" else {*PREDICATES} - ({TOUCHING} - _stated(words))
     opposed = [
         (bool(written) and not agree(written, poles(clause.predicate.split())))
-        or (clause.subject in others)
-        or clause.predicate in unstated
+        or (clause.predicate in (*STATES, TOUCHING) and clause.predicate not in stated)
         for clause in clauses
     ]
+    is_certain = by == "embedding" or not nouns.unknown
+    if by == "edit":
+        named = [
+            out
+            or clause.predicate not in stated
+            or clause.object not in nouns.objects
+            or (nouns.subjects is not None and clause.subject not in nouns.subjects)
+            for clause, out in zip(clauses, opposed, strict=True)
+        ]
+        is_certain, opposed = (is_certain, named) if not all(named) else (False, opposed)
     if by == "edit":
         choices = [None if out else content for out, content in zip(opposed, contents, strict=True)]
         _, similarity, at = process.extractOne(_content(words), choices, scorer=fuzz.ratio)
@@ -182,19 +191,30 @@ def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
         similarities = _vectors(tuple(map(str, clauses))) @ sentence_vectors([text])[0]
         similarities[opposed] = -1.0
         at, score = int(similarities.argmax()), float(similarities.max().clip(0.0, 1.0))
-    return QueryPart(part, Query((replace(clauses[at], negated=negated),)), score if is_read else 0.0)
+    keys = {_key(predicate) for predicate in (*RELATIONS, *STATES)} - {*clauses[at].predicate.split()}
+    is_certain = is_certain and (by == "embedding" or keys.isdisjoint({*words} - {*str(clauses[at]).split()}))
+    return QueryPart(part, Query((replace(clauses[at], negated=negated),)), score if is_read else 0.0, is_certain)
 
 
-def _unstated(written: list[str], by: str) -> set[str]:
-    """Return the states for which a text has no word: "it is 5 o'clock" has none for "closed"."""
-    known = {state: [state.split()[-1]] for state in (STATES if by == "edit" else ())} | {TOUCHING: WORDS["contact"]}
+def _stated(written: list[str]) -> set[str]:
+    """Return the predicates for which a text has a word: "it is 5 o'clock" has none for "closed"."""
     words = [word for word in dict.fromkeys(written[:_LONGEST]) if word not in _EMPTY]
 
-    def is_stated(state: str) -> bool:
-        least = _LEAST_RATIOS[state == TOUCHING]
-        return any(process.extractOne(text, words, scorer=fuzz.ratio, score_cutoff=least) for text in known[state])
+    def is_stated(predicate: str) -> bool:
+        if predicate in STATES or predicate == TOUCHING:
+            texts = WORDS["contact"] if predicate == TOUCHING else [predicate.split()[-1]]
+            least = _LEAST_RATIOS[predicate == TOUCHING]
+            return any(process.extractOne(text, words, scorer=fuzz.ratio, score_cutoff=least) for text in texts)
+        word = _key(predicate)
+        close = [each for each in words if each[0] == word[0]]  # "tight" is not a misspelling of "right"
+        return process.extractOne(word, close, scorer=fuzz.ratio, score_cutoff=_LEAST_RATIOS[1]) is not None
 
-    return {state for state in known if not is_stated(state)}
+    return {name for name in PREDICATES if is_stated(name)}
+
+
+def _key(predicate: str) -> str:
+    """Return the word of a predicate without which a text does not state it: "left" for "left of"."""
+    return next(word for word in reversed(predicate.split()) if word not in ("of", "with", "to"))
 
 
 def _content(words: list[str]) -> str:
@@ -317,11 +337,11 @@ class StepMapper:
 @lru_cache(maxsize=4096)
 def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
     """Return the query nearest to a condition (None if the condition has too many clauses) and the distance."""
-    words = _with_object(_with_target(plain_negations(text), task), task)
+    words = _with_relation(_with_object(_with_target(plain_negations(text), task), task), task)
     words = _phrases("conditions").sub(lambda match: WORDS["conditions"][match[0]], words)
     with suppress(QueryError):
         match = nearest_query(words, task)
-        if len(match.parts) <= _MOST_CLAUSES:
+        if len(match.parts) <= _MOST_CLAUSES and all(part.is_certain for part in match.parts):
             return match.query, 1.0 - match.least_score
     return None, 1.0
 
@@ -346,6 +366,17 @@ def _with_object(text: str, task: Task) -> str:
         return f"the {before[-1]}" if before else it[0]
 
     return re.sub(r"(?<=\w )it\b", named, text)
+
+
+def _with_relation(text: str, task: Task) -> str:
+    """Repeat the relation to two objects: "near the mug and the goal" gives "near the mug and near the goal"."""
+    names = "|".join(map(re.escape, sorted(task.object_names, key=len, reverse=True)))
+    relations = "|".join(map(re.escape, sorted(RELATIONS, key=len, reverse=True)))
+    return re.sub(
+        rf"^((?:(?!\bnot\b|\bor\b).)*\b({relations}) (?:the )?(?:{names}) and )((?:the )?(?:{names}))(?=$| and )",
+        r"\1\2 \3",
+        text,
+    )
 
 
 @cache

@@ -286,6 +286,94 @@ def test_a_condition_without_a_word_for_the_state_is_not_that_state(text, wrong)
     assert match.least_score < 0.6 or wrong not in str(match.query)
 
 
+def read_condition(text, task):
+    """Return the query as which a step's condition is read; None if the step is left out, with its condition named."""
+    decoded = lw.decode_plan(f"- When {text}, the robot should ponder it.\n", task, "basic_md")
+    if decoded.plan is None:
+        assert any(text in note.text for note in decoded.notes)
+        return None
+    return decoded.plan.steps[0].condition
+
+
+@pytest.mark.parametrize(
+    ("text", "task"),
+    [
+        ("the dog is near the puck", "push"),
+        ("the operator's hand is near the puck", "push"),
+        ("the human hand is near the puck", "push"),
+        ("the parked car is near the puck", "push"),
+        ("the gripper is above the lamp", "push"),
+        ("the gripper is close to the wall", "push"),
+        ("the gripper is near the other puck", "push"),
+        ("the gripper is near the corner", "push"),
+        ("the gripper is above the table", "push"),
+        ("the puck is held by the visitor", "push"),
+        ("the gripper is near the puck and the radio is on", "push"),
+        ("the gripper is near the door handle", "drawer-open"),
+        ("the peg is near the gripper", "window-open"),
+    ],
+)
+def test_an_object_that_the_task_lacks_is_not_another_object(text, task):
+    assert read_condition(text, task) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "task", "expected"),
+    [
+        ("the griper is near the puk", "push", "the gripper is near the puck"),
+        ("the robot's left finger is above the blue puck", "push", None),
+        ("the robotic arm is above the blue puck", "push", "the gripper is above the puck"),
+        ("the hand is near the cup", "coffee-push", "the gripper is near the mug"),
+        ("the gripper is near the rim of the cup", "coffee-push", "the gripper is near the mug"),
+        ("the gripper is above the drawer", "drawer-open", "the gripper is above the drawer handle"),
+        ("the gripper is near the drawer handle", "handle-press-side", "the gripper is near the handle"),
+        ("the gripper is near the knob", "door-open", "the gripper is near the door handle"),
+        ("the gripper is near the goal", "shelf-place", "the gripper is near the shelf"),
+        ("the robot is above the puck", "push", "the gripper is above the puck"),
+        ("the gripper is near the puck and the target location", "push",
+         "the gripper is near the puck and near the target location"),
+    ],
+)  # fmt: skip
+def test_an_object_is_read_by_its_other_names(text, task, expected):
+    assert read_condition(text, task) == (None if expected is None else parse_query(expected, task))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("the gripper is within 3 centimetres of the puck", "the gripper is near the puck"),
+        ("the gripper is not within reach of the puck", "the gripper is not near the puck"),
+        ("the gripper is near the right corner of the puck", "the gripper is near the puck"),
+        ("the gripper is above the front of the puck", "the gripper is above the puck"),
+        ("the gripper is at the right-hand side of the puck", "the gripper is right of the puck"),
+        ("the gripper is to the side of the puck", "the gripper is left of the puck or right of the puck"),
+        ("the puck is not currently held", "the gripper is not around the puck"),
+        ("the puck is being gripped by the hand", "the gripper is around the puck"),
+        ("the puck is ungrasped", "the gripper is not around the puck"),
+        ("the gripper is open and/or near the puck", "the gripper is open or near the puck"),
+    ],
+)
+def test_a_relation_is_read_as_one_with_the_same_meaning(text, expected):
+    assert read_condition(text, "push") == parse_query(expected, "push")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "the puck is lifted",
+        "the puck is light",
+        "the gripper is facing the puck",
+        "the gripper is parallel to the puck",
+        "the gripper is pressing the puck",
+        "the gripper is partially closed",
+        "the gripper is open above the puck",
+        "the gripper is holding the puck near the target location",
+    ],
+)
+def test_no_relation_is_read_that_the_text_does_not_state(text):
+    assert read_condition(text, "push") is None
+
+
 def test_two_subjects_share_a_predicate():
     query = nearest_query("the gripper and the puck are above the target location", "push").query
     assert query == parse_query(
