@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from lw_torchrl._util.checks import check_choice, shown, typed
+from lw_torchrl.language.drafts import without_drafts
 from lw_torchrl.language.expressions import (
     FALSE,
     Expression,
@@ -43,7 +44,7 @@ from lw_torchrl.language.roles import ignored_words
 from lw_torchrl.language.skills import Skills, canonical_skill
 from lw_torchrl.language.step_parser import skill_effect
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
-from lw_torchrl.language.thoughts import without_drafts, without_thoughts
+from lw_torchrl.language.thoughts import without_thoughts
 
 
 @dataclass(frozen=True)
