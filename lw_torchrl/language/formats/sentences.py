@@ -78,9 +78,7 @@ class SentenceReading(Reading):
         text = PATTERNS["summary"].sub("", text.strip(" \t#"))
         if (defined := PATTERNS["defined"].fullmatch(text)) and is_state(defined[3]):
             text = f'"{defined[2]}": {defined[3]}'
-        text = text.replace("*", "").strip("`")
-        for pattern, plain in _REWRITINGS:
-            text = pattern.sub(plain, text)
+        text = usual_words(text.replace("*", "").strip("`"))
         return PATTERNS["named"].sub(self.define, text).strip("\"'")
 
     def define(self, named: re.Match[str]) -> str:
@@ -94,6 +92,13 @@ class SentenceReading(Reading):
             return named[0]
         self.refers.names[name] = meaning.rstrip(".")
         return ""
+
+
+def usual_words(text: str) -> str:
+    """Rewrite phrases that the grammar of clauses does not know."""
+    for pattern, plain in _REWRITINGS:
+        text = pattern.sub(plain, text)
+    return text
 
 
 def _unwrapped(lines: list[str]) -> list[str]:
