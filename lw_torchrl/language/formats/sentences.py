@@ -74,7 +74,8 @@ class SentenceReading(Reading):
         content = self.content(item[3] if item else line)
         is_open = content.endswith(":") and not is_heading and _indent(following) <= indent
         is_split = is_open or following.lower().startswith("then ")
-        case = "if" if is_split else "act" if self.is_below else "state" if item and following else ""
+        goes_on = self.is_below and PATTERNS["line_start"].match(following.lstrip()) is None
+        case = "if" if is_split else "act" if goes_on else "state" if item and following else ""
         self.is_case = bool(case) and not has_item and {clause.kind for clause in clauses(content)} == {case}
         is_head = is_heading or (self.is_case and case != "act")
         is_head |= _indent(following) > indent and (has_item or item is not None)
