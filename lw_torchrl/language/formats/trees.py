@@ -84,6 +84,7 @@ _KINDS = (*_JOINS, "loop")
 _LABELS = ("name", "comment", "start", "type")
 _PROSE = re.compile(r"[.;?] +\w|, *(?:if|unless|otherwise)\b", re.IGNORECASE)
 _SENTENCE = re.compile(r"(?:if|when|unless|otherwise|while)\b.*[,:]", re.IGNORECASE)
+_CONDITIONAL = re.compile(r"\b(?:if|when|unless|otherwise|while)\b", re.IGNORECASE)
 _AND_OR = re.compile(r"\s*(?:\band\b|\bor\b|\bnot\b|[()&|!]+)\s*", re.IGNORECASE)
 
 
@@ -98,7 +99,8 @@ class TreeReading(Reading):
                 block = text if isinstance(block, list) else block
                 value = self.without_asides(value, start, block)
                 texts = [text for key, text in texts_in(value) if role_of(key) not in ("name", "comment")]
-                if value is None or ("{" not in block and any(map(_PROSE.search, texts))):
+                is_prose = any(map(_PROSE.search, texts)) or all(map(_CONDITIONAL.search, texts))
+                if value is None or ("{" not in block and is_prose):
                     continue  # sentences with colons look like YAML
                 tree = _Tree(self, block, start, value)
                 node = tree.node(value)
