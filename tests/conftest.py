@@ -16,9 +16,9 @@ from lw_torchrl._util import files as _files
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run files with slow tests first, so that parallel processes end at about the same time."""
+    """Run the goldens and then other slow files first, so that parallel processes end at about the same time."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    items.sort(key=lambda item: (item.path.stem != "test_goldens", item.path not in slow))
 
 
 def pytest_collection_finish() -> None:

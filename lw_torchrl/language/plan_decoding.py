@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from lw_torchrl._util.checks import check_choice, shown, typed
+from lw_torchrl.language.drafts import without_drafts
 from lw_torchrl.language.expressions import (
     FALSE,
     Expression,
@@ -20,15 +21,15 @@ from lw_torchrl.language.expressions import (
 )
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, is_verb, listed_steps
-from lw_torchrl.language.formats.clauses import PATTERNS
+from lw_torchrl.language.formats.clauses import PATTERNS, base_verb
 from lw_torchrl.language.formats.clauses import clauses as cut
 from lw_torchrl.language.formats.detection import read_any, section_notes
 from lw_torchrl.language.formats.prose import ProseReading
-from lw_torchrl.language.formats.sentences import SentenceReading
+from lw_torchrl.language.formats.sentences import SentenceReading, usual_words
 from lw_torchrl.language.library import expand
 from lw_torchrl.language.nearest import MappedQuery, StepMapper
 from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line
-from lw_torchrl.language.polarity import instruction
+from lw_torchrl.language.polarity import forbids, instruction
 from lw_torchrl.language.programs import (
     Action,
     Block,
@@ -43,7 +44,7 @@ from lw_torchrl.language.roles import ignored_words
 from lw_torchrl.language.skills import Skills, canonical_skill
 from lw_torchrl.language.step_parser import skill_effect
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
-from lw_torchrl.language.thoughts import without_drafts, without_thoughts
+from lw_torchrl.language.thoughts import without_thoughts
 
 
 @dataclass(frozen=True)
@@ -161,10 +162,13 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
     ]
     steps = [_mapped(clause, mapper, notes) for clause in clauses]
     notes += section_notes(reading, section, owner)
-    if read is None and isinstance(reading, ProseReading | SentenceReading):
-        said = [text for clause in clauses for text in (clause.skill, clause.reason)]
-        known = {clause.line for clause in clauses} | {note.line for note in notes}
-        notes += _unread(text, [*said, *(note.text for note in notes)], known)
+    is_prose = isinstance(reading, ProseReading | SentenceReading)
+    skills_said = [clause.skill for clause in clauses]
+    if is_prose or not clauses:
+        notes += _prohibitions(text, [*skills_said, *(note.text for note in notes)])
+    if is_prose and read is None:
+        said = [*skills_said, *(clause.reason for clause in clauses), *(note.text for note in notes)]
+        notes += _unread(text, said, {clause.line for clause in clauses} | {note.line for note in notes})
 
     def plan(skills: Sequence[str | None]) -> ConditionalPlan | None:
         kept = tuple(
@@ -190,20 +194,42 @@ def _unread(text: str, said: Sequence[str], known: Collection[int]) -> list[Note
         said: the texts of the steps and of the notes.
         known: the numbers of their lines.
     """
-    words_said = [{*re.findall(r"[\w']+", each.lower())} for each in dict.fromkeys(said)]
+    is_said = _within(said)
     notes = list[Note]()
     for number, line in enumerate(text.splitlines(), 1) if known else ():
         noted = len(notes)
         for phrase in (part.strip(" -'") for part in _CLAUSES.split(line[:8_000])):
-            words = {*re.findall(r"[\w']+", phrase.lower())} - {"the", "a", "it", "there", "first", "only"}
-            is_said = any(words <= each for each in words_said)
-            if 1 < len(phrase.split()) <= 40 and is_verb(phrase.split()) and not is_said:
+            if 1 < len(phrase.split()) <= 40 and is_verb(phrase.split()) and not is_said(phrase):
                 notes.append(Note(number, f"no step has the action {shown(phrase)}"))
         item = None if number in known or len(notes) > noted else PATTERNS["item"].match(line)
         is_short = item is not None and 2 < len(item[3].split()) <= 40
         if item and is_short and not PATTERNS["restarts"].match(item[3]) and {c.kind for c in cut(item[3])} == {"say"}:
             notes.append(Note(number, f"the line is not read: {shown(line.strip())}"))
     return notes[:_MOST_NOTES]
+
+
+def _prohibitions(text: str, said: Sequence[str]) -> list[Note]:
+    """Return a note for each clause of prose that forbids an action and is in neither a step nor another note."""
+    is_said, notes = _within(said), list[Note]()
+    for number, line in enumerate(text.splitlines(), 1):
+        line = re.sub(r"^[\W\d]+|\*", "", line[:8_000])
+        for clause in cut(usual_words(line)) if forbids(line, is_whole=False) else ():
+            words = {*re.findall(r"\w+", clause.text.lower())} - {"do", "does"}
+            is_act = any(is_verb([word]) or base_verb(word) for word in words)
+            if clause.kind in ("say", "act") and is_act and forbids(clause.text) and not is_said(clause.text):
+                notes.append(Note(number, f"{shown(clause.text)} is left out: it forbids an action"))
+    return notes[:_MOST_NOTES]
+
+
+def _within(said: Sequence[str]) -> Callable[[str], bool]:
+    """Return a function of a phrase: whether one of the texts contains all of its words."""
+    words_said = [{*re.findall(r"[\w']+", each.lower())} for each in dict.fromkeys(said)]
+
+    def is_said(phrase: str) -> bool:
+        words = {*re.findall(r"[\w']+", phrase.lower())} - {"the", "a", "it", "there", "first", "only"}
+        return any(words <= each for each in words_said)
+
+    return is_said
 
 
 def _plain_characters(text: str) -> str:

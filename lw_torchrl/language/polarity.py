@@ -31,6 +31,7 @@ _FORBIDS = re.compile(rf"(?<![\w'-]){_any('forbids')}(?![\w'-])", re.IGNORECASE)
 _CLAUSE = re.compile(rf"(?:^|,?\s+|(?=[,;.:])){_any('clauses')}", re.IGNORECASE)
 _CAUTION = re.compile(rf"(?:please )?{_any('cautions')}", re.IGNORECASE)
 _RESTS = re.compile(rf"(?:please |then |now |just )*{_any('rests')}", re.IGNORECASE)
+_ENDED = re.compile(rf"(?:please |then |now |just )*{_any('ended')}", re.IGNORECASE)
 _EXCEPTION = re.compile(rf",?\s+{_any('exceptions')}\s+(.+)", re.IGNORECASE)
 _AFFIRMS = re.compile(rf"(?:(?:{_any('affirms')}|{_any('manner')})\s+)*", re.IGNORECASE)
 _CANONICAL = WORDS["canonical"]
@@ -126,9 +127,21 @@ def instruction(skill: str) -> Instruction:
         is_inside = re.match(r"not \w+, ", aside)  # "push the peg past, not into, the hole"
         if not text.strip() or is_inside or _CAUTION.fullmatch(text.strip()):
             return Instruction("", aside, exception)
-    if _NOT_YET.fullmatch(aside) or (not rests(text) and _is_only_mentioned(text)):
+    is_ended = _ENDED.match(text) is not None or (not rests(text) and _is_only_mentioned(text))
+    if _NOT_YET.fullmatch(aside) or is_ended:
         return Instruction("", aside or text, exception)
     return Instruction(text, aside, exception)
+
+
+def forbids(text: str, is_whole: bool = True) -> bool:
+    """Return whether a clause consists of a prohibition; unless ``is_whole``, whether a text contains one.
+
+    Example:
+        >>> forbids("the robot shouldn't close the gripper"), forbids("push the mug, but do not lift it")
+        (True, False)
+    """
+    has_word = _FORBIDS.search(_APOSTROPHE.sub("'", text)) is not None
+    return has_word and not (is_whole and instruction(text).text)
 
 
 def command_form(word: str) -> str | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from lw_torchrl._util.checks import shown
+from lw_torchrl.language.drafts import cut_out
 from lw_torchrl.language.formats.base import Note
 
 _THOUGHT = (
@@ -53,22 +53,6 @@ _NEXT_HEADING = re.compile(
     r"|(?:[\w']+ ){0,5}(?:answer|plan|output|solution|rules|response|result|code)\b[^.:\n]{0,40}:[ \t]*)$",
     re.IGNORECASE | re.MULTILINE,
 )
-_BLOCK = r"[ \t]*```[^\n]*\n(?:(?![ \t]*```)[^\n]*\n)*[ \t]*```[ \t]*$"
-_IF = r"\b(?:when|whenever|if|once|unless)\b"
-_RULE = re.compile(rf"^[^\n]*{_IF}|^[ \t]*```\w+$", re.IGNORECASE | re.MULTILINE)
-_RULES = rf"(?:(?![^\n]*:[ \t]*$)[^\n]*{_IF}[^\n]*(?:\n|\Z))+"
-_DRAFT = re.compile(
-    rf"^[ \t]*>[ \t]+{_IF}[^\n]*"  # a quotation
-    rf"|^[^\w\n\"']*(?:[❌✗✘]|(?:an? )?(?:wrong|incorrect|bad)(?: \w+)?:)[ \t]+(?=[^\n]*{_IF})[^\n]+"
-    r"|^[^\w\n]*(?:(?:an?|the|as)\s+)?"  # rules or a block below a label such as "Wrong:"
-    r"(?:wrong|incorrect|bad|do not|don't|never|avoid|not like|instead of|counter-?example)\b"
-    rf"[^.\n]*:[^\w\n]*\n\s*(?:{_BLOCK}|{_RULES})"
-    rf"|^[^\w\n]*(?:(?:for |an )?example|e\.g\.|(?:first|initial|old) \w+)\b[^.\n]*:[^\w\n]*\n\s*{_BLOCK}"
-    rf"|^{_BLOCK}(?=\s*(?:that|this)(?: is| was|'s) (?:wrong|incorrect|not right)\b)",
-    re.IGNORECASE | re.MULTILINE,
-)
-_DIFF = re.compile(r"^```diff\n.*?^```", re.MULTILINE | re.DOTALL)
-_STRUCK = re.compile(r"~~(?=\S)[^~\n]+~~|<(del|s|strike)>.*?</\1>", re.IGNORECASE)
 
 
 def without_thoughts(text: str, notes: list[Note]) -> str:
@@ -87,38 +71,13 @@ def without_thoughts(text: str, notes: list[Note]) -> str:
     spans, is_cut = _tagged(text)
     if not spans:
         spans = [*_marked(text), *_headed(text)]
-        if not _cut(text, spans).strip():
+        if not cut_out(text, spans).strip():
             return text
     if not spans:
         return text
     how = " (there is no end tag)" if is_cut else ""
     notes.append(Note(text.count("\n", 0, spans[0][0]) + 1, f"the model's reasoning is left out{how}"))
-    return _cut(text, spans)
-
-
-def without_drafts(text: str, notes: list[Note]) -> str:
-    """Remove what an answer strikes out, quotes, or calls wrong or an example, and append notes.
-
-    Except for struck-out text, a part is removed only if a rule or another block of code remains.
-    """
-    spans = [match.span() for match in _STRUCK.finditer(text)]
-    drafts = [match.span() for match in _DRAFT.finditer(text)]
-    for fence in _DIFF.finditer(text):
-        removed = re.compile(r"^-.*$", re.MULTILINE).finditer(text, *fence.span())
-        drafts = sorted([*drafts, *(match.span() for match in removed)])
-    spans = sorted([*spans, *drafts]) if _RULE.search(_cut(text, drafts)) else spans
-    for start, end in spans:
-        reason = "struck out" if text[start] in "~<" else "a draft or a quotation"
-        notes.append(Note(text.count("\n", 0, start) + 1, f"{reason}: {shown(text[start:end].strip())} is left out"))
-    return _cut(text, spans)
-
-
-def _cut(text: str, spans: list[tuple[int, int]]) -> str:
-    kept, at = list[str](), 0
-    for start, end in spans:
-        kept += [text[at:start], "\n" * text.count("\n", start, end)]
-        at = max(at, end)
-    return "".join([*kept, text[at:]])
+    return cut_out(text, spans)
 
 
 def _tagged(text: str) -> tuple[list[tuple[int, int]], bool]:

@@ -136,8 +136,9 @@ class ImageQueryEvaluator(ClauseEvaluator):
 
     network: PointingNetwork
     seen_dims = 3
-    rows_at_once = 4
-    """Number of rows per forward pass in a rollout; fixed, so that results do not depend on other rows."""
+    rows_at_once = 16
+    """Number of rows per forward pass in a rollout; fixed, so that results do not depend on other rows. With 4, some
+    processors round the last row differently."""
 
     @typed
     def __init__(

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from benchmarks.decoding import mutated
+from lw_torchrl.language.drafts import without_drafts
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.nearest import StepMapper
 from lw_torchrl.language.plan_decoding import decode_as, without_thoughts
@@ -122,6 +123,16 @@ DRAFT, RULE = "If the gripper is above the puck, lift the puck.", "If the grippe
         f"```diff\n- {DRAFT}\n+ {RULE}\n```",
         f"First version:\n```\n{DRAFT}\n```\nAnswer:\n```\n{RULE}\n```",
         f"```\n{DRAFT}\n```\nThis was wrong.\n```\n{RULE}\n```",
+        f"1. {DRAFT}\n\nOops, this does not work. Let me try again.\n\n1. {RULE}",
+        f"- {DRAFT}\n\nPlease ignore the above.\n- {RULE}",
+        f"{DRAFT}\n\n**Revised plan**\n\n{RULE}",
+        f"- {DRAFT}\n\nHere is the improved version.\n- {RULE}",
+        f"# Rejected\n\n## Idea\n{DRAFT}\n\n# Plan\n{RULE}",
+        f"{RULE}\n\n### Old rules\n\n{DRAFT}",
+        f"Example:\n- {DRAFT}\n\nRules:\n- {RULE}",
+        f'The prompt says: "{DRAFT}"\n\n- {RULE}',
+        f"- {RULE}\n- Unlike “{DRAFT}” this is safe.",
+        f'{RULE}\n"{DRAFT}" would be dangerous.',
     ],
 )
 def test_drafts_are_left_out_by_name(text):
@@ -133,6 +144,32 @@ def test_drafts_are_left_out_by_name(text):
 @pytest.mark.parametrize("text", [f"> {RULE}", f"For example:\n```\n{RULE}\n```"])
 def test_an_answer_that_is_only_a_draft_is_read(text):
     assert [step.skill for step in lw.decode_plan(text, "push").plan.steps] == ["close the gripper"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f'- "{DRAFT}"\n- "{RULE}"',
+        f'Rule 1: "{DRAFT}"\nRule 2: "{RULE}"',
+        f"{DRAFT}\n\nThis is correct.\n\n{RULE}",
+        f"{DRAFT}\n\nThis does not work in the dark.\n\n{RULE}",
+        f"{DRAFT}\n\nFinal plan summary:\n{RULE}",
+        f"## Plan\n{DRAFT}\n\n## Better grip phase\n{RULE}",
+        f"- {DRAFT}\n- {RULE}\n\nFinal answer: see above.",
+    ],
+)
+def test_text_that_is_not_withdrawn_is_read(text):
+    skills = [step.skill for step in lw.decode_plan(text, "push").plan.steps]
+    assert skills == ["lift the puck", "close the gripper"]
+
+
+@pytest.mark.parametrize(
+    "text", ["\n" * 65_000, "```\n" * 16_000, '"if ' + "," * 60_000, "# old\n" * 10_000, "a " * 32_000]
+)
+def test_drafts_are_found_in_linear_time(text):
+    start = thread_time()
+    assert without_drafts(text, []) is not None
+    assert thread_time() - start < 3.0
 
 
 def test_items_of_a_list_in_html_are_rules():

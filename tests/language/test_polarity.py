@@ -256,6 +256,51 @@ def test_an_action_in_an_unknown_frame_is_not_done(frame, verb):
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "Avoid lifting the mug while the gripper is near the mug.",
+        "When the gripper is near the mug, the robot mustn't lift the mug.",
+        "When the gripper is near the mug, it is prohibited to lift the mug.",
+        "When the gripper is near the mug, the mug can't be lifted.",
+        "Caution: lifting the mug is not allowed.",
+        "Never, ever lift the mug.",
+        "Do not, under any circumstances, lift the mug.",
+        "Nobody may lift the mug.",
+        "Do not let the robot lift the mug.",
+    ],
+)
+@pytest.mark.parametrize("line", ["{}", "- {}", "**Warning:** {}", "2. {}"])
+def test_a_prohibition_is_named_in_a_note(text, line):
+    decoded = lw.decode_plan(f"1. If {FAR_AWAY}, {OPEN}.\n{line.format(text)}\n", "coffee-push")
+    assert [step.skill for step in decoded.plan.steps] == [OPEN]
+    assert any("lift" in note.text for note in decoded.notes)
+    alone = lw.decode_plan(line.format(text), "coffee-push")
+    assert alone.plan is None
+    assert any("lift" in note.text for note in alone.notes)
+
+
+@pytest.mark.parametrize("verb", ["stop", "cease", "quit"])
+def test_a_skill_that_ends_an_action_is_left_out_with_a_note(verb):
+    rules = f"- If {NEAR}, {verb} lifting the mug.\n- If {FAR_AWAY}, stop."
+    code = f'def coffee_push(robot):\n    if check("{NEAR}"):\n        robot.{verb}_lifting("the mug")\n'
+    for text, skills in ((rules, ["stop"]), (f"{code}    else:\n        robot.stop()\n", ["stop"])):
+        decoded = lw.decode_plan(text, "coffee-push")
+        assert [step.skill for step in decoded.plan.steps] == skills
+        assert any(f"{verb} lifting the mug" in note.text for note in decoded.notes)
+
+
+@pytest.mark.parametrize("test", ["not robot.lift('the mug')", "robot.lift('the mug')"])
+def test_an_action_in_an_assertion_is_left_out_with_a_note(test):
+    code = (
+        f'def coffee_push(robot):\n    if check("{NEAR}"):\n        assert {test}\n        robot.open("the gripper")\n'
+    )
+    decoded = lw.decode_plan(code, "coffee-push")
+    (step,) = decoded.plan.steps
+    assert (step.condition, step.skill) == (parse_query(NEAR, "coffee-push"), OPEN)
+    assert any("lift" in note.text for note in decoded.notes)
+
+
+@pytest.mark.parametrize(
     "frame",
     ["start {}ing it", "keep on {}ing it", "remember to {} it", "go ahead and {} it", "use the gripper to {} it"],
 )

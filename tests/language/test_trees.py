@@ -213,6 +213,30 @@ def test_texts_of_actions_that_no_path_reaches_are_named():
     assert "'reach' was not requested; 1 step left out" in notes
 
 
+DRAFT = {"when": "gripper near puck", "do": "lift the puck"}
+RULE = {"when": "gripper near puck", "do": "grasp the puck"}
+
+
+@pytest.mark.parametrize("key", ["reasoning", "notes", "example_2", "old_rules", "chain_of_thought", "rejected"])
+@pytest.mark.parametrize("value", [DRAFT, [DRAFT], "When the gripper is near the puck, lift the puck."])
+def test_what_is_not_a_part_of_the_plan_is_left_out_with_a_note(key, value):
+    for row in ({key: value, "rules": [RULE]}, {"rules": [{**RULE, key: value}]}):
+        decoded = lw.decode_plan(json.dumps(row), "push")
+        assert [step.skill for step in decoded.plan.steps] == ["grasp the puck"]
+        assert any("lift the puck" in note.text and key in note.text for note in decoded.notes)
+
+
+def test_a_rule_that_is_marked_as_a_draft_is_left_out_with_a_note():
+    decoded = lw.decode_plan(json.dumps([{**DRAFT, "draft": True}, {**RULE, "draft": False}]), "push")
+    assert [step.skill for step in decoded.plan.steps] == ["grasp the puck"]
+    assert any("lift the puck" in note.text for note in decoded.notes)
+
+
+def test_an_example_without_a_plan_is_read():
+    decoded = lw.decode_plan(json.dumps({"example": [RULE]}), "push")
+    assert [step.skill for step in decoded.plan.steps] == ["grasp the puck"]
+
+
 HOSTILE = {
     "lists": "[" * 20_000,
     "closed lists": "[" * 20_000 + "]" * 20_000,

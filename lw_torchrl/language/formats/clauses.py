@@ -228,7 +228,7 @@ def _main(text: str, stop: str) -> Clause:
 
 def is_state(text: str) -> bool:
     """Return whether a clause describes the scene: "the gripper is near the mug", "gripper near mug" or "open"."""
-    if _IS_MODAL.search(text):
+    if _IS_MODAL.search(text) or PATTERNS["must_not"].search(text):
         return False
     if inside := re.search(r" \(([^()]+)\)$", text):  # "the robot has the puck (the gripper is near the puck)"
         return is_state(inside[1].rpartition(": ")[2]) or is_state(text[: inside.start()])
@@ -236,6 +236,8 @@ def is_state(text: str) -> bool:
     relation, words = RELATION.search(text), text.split()
     if relation is None or PATTERNS["no_state"].match(text):
         return False
+    if (inner := PATTERNS["to_do"].search(text)) and _is_verb(inner[1].split()):
+        return False  # "it is forbidden to open the gripper"
     if relation.start() == 0:
         is_verb_form = words[0].lower() in ("open", "close", "shut", "touch")
         return not is_verb_form or len(words) == 1 or words[1] in ("and", "or", "but")

@@ -21,6 +21,7 @@ from lw_torchrl.language.expressions import (
 )
 from lw_torchrl.language.formats.base import Clause, Note, Reading, Section
 from lw_torchrl.language.formats.code import CodeReading
+from lw_torchrl.language.formats.labels import labelled_rules, without_asides
 from lw_torchrl.language.formats.markup import table_rules
 from lw_torchrl.language.formats.prose import ProseReading
 from lw_torchrl.language.formats.python import PythonReading
@@ -59,16 +60,18 @@ def read_any(text: str, mapper: StepMapper, read: Callable[[str], Reading] | Non
 
     Of this group, return the reading that keeps the most actions, and the section of that reading for the task.
     """
+    text = labelled_rules(text)
     groups = list(_GROUPS if not _PRONOUN.search(text) else reversed(_GROUPS))
     if read is not None:
         groups.sort(key=lambda group: read not in group)
         groups = groups if read in groups[0] else [(read,), *groups]
     empty = list[tuple[Reading, Section]]()
     for number, group in enumerate(groups):
-        best = first = _with_clauses(group[0], text, mapper)
+        is_prose, asides = ProseReading in group, list[Note]()
+        plan = without_asides(text, asides) if is_prose else text
+        best = first = _with_clauses(group[0], plan, mapper)
         empty.append(first)
-        is_prose = ProseReading in group
-        own = table_rules(_own_lines(text, first[0], mapper.task)) if is_prose else text
+        own = table_rules(_own_lines(plan, first[0], mapper.task)) if is_prose else plan
         is_about_it = _ABOUT_IT.search(own) is not None
         is_published = bool(first[1].task and first[1].clauses) and not first[0].notes
         is_free = read is None and is_prose and not (is_published and _CONTROL_WORDS.search(own) is None)
@@ -90,6 +93,7 @@ def read_any(text: str, mapper: StepMapper, read: Callable[[str], Reading] | Non
                 ),
             )
         if best[1].clauses:
+            best[0].notes += asides
             if number and read is not None:
                 best[0].note(best[1].clauses[0].line, "the plan is not in the requested format")
             return best

@@ -126,12 +126,20 @@ class LineParser:
     def is_consequence(self, clause: Clause) -> bool:
         """Return whether a clause must be an action, though its verb is unknown: "if the gripper is open, wave"."""
         is_open = self.pending is not None or (len(self.scopes) > self.start and not self.acts)
-        first = clause.text.partition(" ")[0].lower()
         is_after = self.before.kind in ("if", "unless", "ask", *_BACK) and self.before.stop in (",", ":", "?", "")
         is_after |= self.before.kind == "state" and self.before.stop == ":"
-        is_known = first in (*NO_SKILL, *_WORDS["looks"], *_WORDS["no_verbs"], "") or clause.joint in ("and", "or")
+        return is_open and is_after and clause.joint not in ("and", "or") and self.may_be_action(clause)
+
+    def is_listed(self, clause: Clause) -> bool:
+        """Return whether a clause continues a list of actions: "..., and wave" or "...; then wave"."""
+        return bool(self.acts) if clause.joint == "and" or not clause.joint else clause.joint == "then" and self.at > 1
+
+    def may_be_action(self, clause: Clause) -> bool:
+        """Return whether a clause may begin with a verb that is unknown."""
+        first = clause.text.partition(" ")[0].lower()
+        is_known = first in (*NO_SKILL, *_WORDS["looks"], *_WORDS["no_verbs"], "")
         is_known |= any(PATTERNS[name].match(clause.text) is not None for name in ("announces", "repeat", "relation"))
-        return clause.kind == "say" and is_open and is_after and not is_known
+        return clause.kind == "say" and not is_known
 
     # Conditions
 
@@ -160,7 +168,9 @@ class LineParser:
         """Add a condition before or after actions."""
         acts, stop = self.acts, clause.stop
         after = next((each for each in self.clauses[self.at :] if each.kind != "state"), Clause("say", ""))
-        is_aside = self.before.stop == stop == "," and after.kind == "act"
+        is_led = stop == "" and len(self.scopes) > self.start and after is self.next
+        is_led |= self.before.stop == "," and (stop in (",", ":") or after.joint == "then")
+        is_aside = is_led and after.kind == "act"  # whether the condition guards the action after it
         if acts and isinstance(last := acts[-1][1], Action):
             self.refers.acted(last.text)
             if clause.kind == "until" and not clause.joint:
@@ -171,7 +181,8 @@ class LineParser:
             return
         test = self.condition(clause)
         is_other = any(self.opposes(scope, test) for scope in self.scopes[self.start :])
-        if self.before.stop == "." and is_other:
+        is_beside = self.before.stop == "," and stop == ":" and len(self.scopes) == self.start + 1  # "if A: B, if C: D"
+        if is_beside or (self.before.stop == "." and is_other):
             del self.scopes[self.start :]
             self.kept = self.inner = self.start
         self.is_open = self.before.stop in (".", ":", ";") and RELATION.search(clause.text) is not None
@@ -374,6 +385,8 @@ class LineParser:
             self.kept = self.inner if clause.stop == "." else self.kept
         if repeat := PATTERNS["repeat"].match(text):
             self.repeat(repeat, clause.stop)
+        elif self.is_listed(clause) and self.may_be_action(clause):
+            self.reading.note(self.reading.line, f"{shown(text)} is left out: it does not begin with a known verb")
         elif text and MAY_BE_RULE.match(text):
             self.reading.note(self.reading.line, f"{shown(text)} is left out: its condition is not understood")
 
@@ -441,7 +454,9 @@ class LineParser:
         """Add an action to a scope."""
         kept, last = PATTERNS["kept"].match(text), scope[-1] if scope else None
         if go_to := PATTERNS["go_to"].match(text):
-            scope.append(Jump(go_to[1] if int(go_to[1]) > self.reading.step else ""))
+            is_later = int(go_to[1]) > self.reading.step
+            scope.append(Jump(go_to[1] if is_later else ""))
+            self.reading.has_jumps |= is_later
         elif kept and isinstance(last, Action) and last.text.split()[0] == base_verb(kept[1]):
             self.replace([(scope, last)], Action(last.text + (kept[2] or ""), last.line))
         elif text.lower() not in _WORDS["continues"]:

@@ -36,7 +36,9 @@ def table_rules(text: str) -> str:
     """
     text = re.sub(r"(?<=\S)[ \t]*<li\b", "\n<li", re.sub(r"</?[ou]l\b[^>]*>|</li>", "", text))
     text = re.sub(r"^[ \t]*<li\b[^>]*>[ \t]*", "- ", text, flags=re.MULTILINE)
-    text = _ROWS.sub(lambda row: "\n" * row[0].count("\n") + f"\n{_rule(row[1] or row[3], row[2] or row[4])} ", text)
+    text = _ROWS.sub(
+        lambda row: "\n" * row[0].count("\n") + f"\n{rule_sentence(row[1] or row[3], row[2] or row[4])} ", text
+    )
     lines = text.splitlines()
     if max(map(len, lines), default=0) > _LONGEST:
         return text
@@ -51,17 +53,18 @@ def sentences(line: str) -> Iterator[str]:
         return
     bullet = BULLET.match(line)
     first, *others = _SENTENCE.split(line)
-    if not _is_rule(first) and len(others) < 2:
+    if not _isrule_sentence(first) and len(others) < 2:
         first, others = line, []
     if not others and (joined := re.fullmatch(r"(.*?,.*?),?\s+and\s+((?:when|whenever|if)\b[^,]*,.*)", line, re.I)):
-        first, others = joined[1], [joined[2]] if _is_rule(first) else []
+        first, others = joined[1], [joined[2]] if _isrule_sentence(first) else []
         first = first if others else line
     yield first
     for other in others:
         yield f"{bullet[0]}{other}" if bullet and WHEN.match(first, bullet.end()) else other
 
 
-def _rule(condition: str, action: str) -> str:
+def rule_sentence(condition: str, action: str) -> str:
+    """Return a bullet with a rule, from the condition and the action in a table or below labels."""
     condition = re.sub(r"^\s*\(?(?:[a-z]|[ivx]{2,4}|\d+(?:\.\d+)+)[.)]\s+", "", condition, flags=re.IGNORECASE)
     condition = re.sub(r"^\W*(?:when|if|whenever)\s+", "", _bare(condition), flags=re.IGNORECASE)
     lead = re.match(r"(?:otherwise|else),?\s+if\s+", condition, re.IGNORECASE)
@@ -79,7 +82,7 @@ def _bare(text: str) -> str:
     ).strip()
 
 
-def _is_rule(line: str) -> bool:
+def _isrule_sentence(line: str) -> bool:
     start = BULLET.match(line)
     return WHEN.match(line, start.end() if start else 0) is not None
 
@@ -110,4 +113,4 @@ def _tables(lines: list[str]) -> None:
         if columns is None:
             continue
         is_row = len(cells) > max(columns) and re.search(r"\w", row)
-        lines[number] = _rule(cells[columns[0]], cells[columns[1]]) if is_row else ""
+        lines[number] = rule_sentence(cells[columns[0]], cells[columns[1]]) if is_row else ""

@@ -53,6 +53,12 @@ def role_of(key: str) -> str:
     return last if last in (*STRUCTURE, "act", "comment") else first if first in (*STRUCTURE, "act") else ""
 
 
+def is_aside(key: str) -> bool:
+    """Return whether the value of a key is not a part of the plan, such as that of "thoughts" and "example_2"."""
+    words = plain(key).rstrip("0123456789 ").split()
+    return not {" ".join(words), *words[:1], *words[-1:]}.isdisjoint(PROGRAM_WORDS["asides"])
+
+
 @lru_cache(maxsize=4)
 def _relations(predicates: tuple[str, ...]) -> re.Pattern[str]:
     names = {plain(name) for name in (*predicates, *WORDS["conditions"])}

@@ -6,8 +6,9 @@ import re
 
 from lw_torchrl._util.checks import shown
 from lw_torchrl.language.formats.base import END, PROGRAM_WORDS, Reading, is_verb
-from lw_torchrl.language.formats.clauses import PATTERNS, RELATION, clauses, is_state
+from lw_torchrl.language.formats.clauses import PATTERNS, RELATION, clauses, is_action, is_state
 from lw_torchrl.language.formats.line_parser import Choice, LineParser, Open, Part, Repeat
+from lw_torchrl.language.formats.markup import WHEN
 from lw_torchrl.language.formats.phrases import role_of
 from lw_torchrl.language.formats.references import References
 from lw_torchrl.language.programs import Block, Branch, Label, Loop, Node, Sequence, actions_of
@@ -18,7 +19,7 @@ _REWRITINGS = [(re.compile(text, re.IGNORECASE), plain) for text, plain in PROGR
 
 
 class SentenceReading(Reading):
-    """A reader of instructions, which become one tree. Numbered steps run in turn, other lines side by side."""
+    """A reader of instructions, which become one tree. Numbered steps run in turn, rules side by side."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -27,7 +28,9 @@ class SentenceReading(Reading):
         self.refers = References()
         self.opens = list[Open]()
         self.step, self.line = 0, 1
+        self.has_jumps = False  # to later steps
         self.is_case = False  # whether the line above only describes a case: "Case 1: the gripper is open."
+        self.is_below = False  # whether the line above is an action for such a case
         self.levels = list[tuple[float, int]]()  # the indent of each line above, and the number of scopes at its start
         if PATTERNS["to_step"].search(text) is None:
             text = PATTERNS["numbered_rule"].sub(r"\1- ", text)  # "1. the gripper is open -> close it"
@@ -47,40 +50,49 @@ class SentenceReading(Reading):
                 reason = "it is forbidden" if is_forbidden else "it describes the task"
                 self.note(self.line, f"{shown(before.strip())} is left out: {reason}")
                 before = ""
+            self.is_case &= bool(line.strip()) or not self.is_below
             if before.strip():
                 self.read(before, next((each for each in lines[self.line :] if each.strip()), ""), heading)
             if cut:
                 break
-        tree = (Sequence if self.step else Block)(tuple(_built(self.root)))
+        steps: list[Part] = [part for part in self.root if not isinstance(part, Label)]
+        is_in_turn = self.step and (self.has_jumps or not all(isinstance(part, Choice) for part in steps))
+        tree = Sequence(tuple(_built(self.root))) if is_in_turn else Block(tuple(_built(steps)))
         if next(actions_of(tree), None) is not None:
             self.add_tree("", 1, tree)
 
     def read(self, line: str, following: str, is_heading: bool) -> None:
         """Add the clauses of a line, at the depth of its indent."""
         item, indent = PATTERNS["item"].match(line), float(_indent(line))
-        if self.levels and (PATTERNS["reply"].match(line) or (self.is_case and not item)):
+        self.is_below = self.is_case and not item
+        if self.levels and (PATTERNS["reply"].match(line) or self.is_below):
             indent = self.levels[-1][0] + 0.5  # below the condition in the line above
         while self.levels and indent <= self.levels[-1][0]:
             del self.scopes[self.levels.pop()[1] :]
         self.levels.append((indent, len(self.scopes)))
         has_item = PATTERNS["item"].match(following) is not None
         content = self.content(item[3] if item else line)
-        self.is_case = bool(item and following) and not has_item and [c.kind for c in clauses(content)] == ["state"]
-        is_head = is_heading or self.is_case or (_indent(following) > indent and has_item)
+        is_open = content.endswith(":") and not is_heading and _indent(following) <= indent
+        is_split = is_open or following.lower().startswith("then ")
+        goes_on = self.is_below and PATTERNS["line_start"].match(following.lstrip()) is None
+        case = "if" if is_split else "act" if goes_on else "state" if item and following else ""
+        self.is_case = bool(case) and not has_item and {clause.kind for clause in clauses(content)} == {case}
+        is_head = is_heading or (self.is_case and case != "act")
+        is_head |= _indent(following) > indent and (has_item or item is not None)
         if item and item[2] and PATTERNS["alternative"].match(line) is None and self.scopes[-1] is self.root:
             self.step = int(item[2])
             self.root.append(Label(item[2]))
         is_item = item is not None or PATTERNS["bold"].match(line) is not None
-        LineParser(self, content.rstrip("." * self.is_case), is_item, is_head, is_heading).read()
+        is_title = PATTERNS["heading"].fullmatch(item[3] if item else line) and WHEN.match(following.lstrip(" -*"))
+        if not is_title or not is_action(content.rpartition(": ")[2]):
+            LineParser(self, content.rstrip("." * self.is_case), is_item, is_head, is_heading).read()
 
     def content(self, text: str) -> str:
         """Return the content of a line without markup, in usual words; define a name if the line defines one."""
         text = PATTERNS["summary"].sub("", text.strip(" \t#"))
         if (defined := PATTERNS["defined"].fullmatch(text)) and is_state(defined[3]):
             text = f'"{defined[2]}": {defined[3]}'
-        text = text.replace("*", "").strip("`")
-        for pattern, plain in _REWRITINGS:
-            text = pattern.sub(plain, text)
+        text = usual_words(text.replace("*", "").strip("`"))
         return PATTERNS["named"].sub(self.define, text).strip("\"'")
 
     def define(self, named: re.Match[str]) -> str:
@@ -94,6 +106,13 @@ class SentenceReading(Reading):
             return named[0]
         self.refers.names[name] = meaning.rstrip(".")
         return ""
+
+
+def usual_words(text: str) -> str:
+    """Rewrite phrases that the grammar of clauses does not know."""
+    for pattern, plain in _REWRITINGS:
+        text = pattern.sub(plain, text)
+    return text
 
 
 def _unwrapped(lines: list[str]) -> list[str]:
@@ -121,7 +140,8 @@ def _indent(line: str) -> int:
         and not content.rstrip("* ").endswith(":")
     ):
         return len(content) - len(content.lstrip("#")) or 7
-    return 10 + 2 * blanks + (PATTERNS["item"].match(line) is not None) + len(re.findall(r"^[\d.]+", content)[:1])
+    is_item = PATTERNS["item"].match(line) is not None and not content[:1].isalpha()  # "Step 1:" may be above a list
+    return 10 + 2 * blanks + is_item + len(re.findall(r"^[\d.]+", content)[:1])
 
 
 def _built(parts: list[Part]) -> list[Node]:

@@ -36,6 +36,7 @@ from lw_torchrl.language.formats.phrases import (
     ROLES,
     STRUCTURE,
     comparison_of,
+    is_aside,
     is_bare,
     is_command,
     is_comparator,
@@ -83,6 +84,7 @@ _KINDS = (*_JOINS, "loop")
 _LABELS = ("name", "comment", "start", "type")
 _PROSE = re.compile(r"[.;?] +\w|, *(?:if|unless|otherwise)\b", re.IGNORECASE)
 _SENTENCE = re.compile(r"(?:if|when|unless|otherwise|while)\b.*[,:]", re.IGNORECASE)
+_CONDITIONAL = re.compile(r"\b(?:if|when|unless|otherwise|while)\b", re.IGNORECASE)
 _AND_OR = re.compile(r"\s*(?:\band\b|\bor\b|\bnot\b|[()&|!]+)\s*", re.IGNORECASE)
 
 
@@ -95,8 +97,10 @@ class TreeReading(Reading):
             try:
                 value = usual_shape(parse_value(block) if isinstance(block, str) else [*map(parse_value, block)])
                 block = text if isinstance(block, list) else block
+                value = self.without_asides(value, start, block)
                 texts = [text for key, text in texts_in(value) if role_of(key) not in ("name", "comment")]
-                if value is None or ("{" not in block and any(map(_PROSE.search, texts))):
+                is_prose = any(map(_PROSE.search, texts)) or all(map(_CONDITIONAL.search, texts))
+                if value is None or ("{" not in block and is_prose):
                     continue  # sentences with colons look like YAML
                 tree = _Tree(self, block, start, value)
                 node = tree.node(value)
@@ -114,6 +118,28 @@ class TreeReading(Reading):
             is_program = "{" in str(value) or _has_condition(node) or all(map(is_told, texts))  # not a list in prose
             if node is not None and texts and is_program:
                 self.add_tree("", start + 1, node)
+
+    def without_asides(self, value: Any, start: int, text: str) -> Any:
+        """Remove thoughts, examples and comments, unless no action remains, and note those that may be rules."""
+        removed = list[tuple[str, Any]]()
+
+        def rest(value: Any) -> Any:
+            if isinstance(value, list):
+                return [*map(rest, value)]
+            if not isinstance(value, dict):
+                return value
+            asides = [key for key, each in value.items() if is_aside(str(key)) and truth_of(each) is None]
+            removed.extend((str(key), value[key]) for key in asides)
+            return {key: rest(each) for key, each in value.items() if key not in asides}
+
+        kept = rest(value)
+        if not removed or not has_action(kept):
+            return value
+        for key, each in removed:
+            if has_action([each]) or any(_SENTENCE.match(text) for _, text in texts_in([each])):
+                line = start + 1 + text.count("\n", 0, max(0, text.find(key)))
+                self.note(line, f"{shown(each)} is left out: {shown(key)} is not a part of the plan")
+        return kept
 
 
 class _Tree:
@@ -287,7 +313,8 @@ class _Tree:
     def object(self, row: dict[Any, Any], hint: str) -> Node | None:
         """Convert an object: its type and flags are read here, its other fields by :meth:`branch`."""
         flags = {plain(str(key)): truth_of(value) for key, value in row.items()}
-        if True in (flags.get("disabled"), flags.get("skip")) or flags.get("enabled") is False:
+        is_off = any(flag and (key in ("disabled", "skip") or is_aside(key)) for key, flag in flags.items())
+        if is_off or flags.get("enabled") is False:
             self.reading.note(self.line(str(next(iter(row)))), "a disabled part is left out")
             return None
         if self.has_edges and (machine := self.machine(row)) is not None:
