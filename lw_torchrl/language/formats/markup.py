@@ -53,10 +53,10 @@ def sentences(line: str) -> Iterator[str]:
         return
     bullet = BULLET.match(line)
     first, *others = _SENTENCE.split(line)
-    if not _isrule_sentence(first) and len(others) < 2:
+    if not _is_rule(first) and len(others) < 2:
         first, others = line, []
     if not others and (joined := re.fullmatch(r"(.*?,.*?),?\s+and\s+((?:when|whenever|if)\b[^,]*,.*)", line, re.I)):
-        first, others = joined[1], [joined[2]] if _isrule_sentence(first) else []
+        first, others = joined[1], [joined[2]] if _is_rule(first) else []
         first = first if others else line
     yield first
     for other in others:
@@ -82,7 +82,7 @@ def _bare(text: str) -> str:
     ).strip()
 
 
-def _isrule_sentence(line: str) -> bool:
+def _is_rule(line: str) -> bool:
     start = BULLET.match(line)
     return WHEN.match(line, start.end() if start else 0) is not None
 
