@@ -11,9 +11,9 @@ from lw_torchrl.language.formats.base import Note
 _BLOCK = r"[ \t]*```[^\n]*\n(?:(?![ \t]*```)[^\n]*\n)*[ \t]*```[ \t]*$"
 _IF = r"\b(?:when|whenever|if|once|unless)\b"
 _RULE = re.compile(rf"^[^\n]*{_IF}|^[ \t]*```\w+$", re.IGNORECASE | re.MULTILINE)
-_RULES = rf"(?:(?![^\n]*:[ \t]*$)[^\n]*{_IF}[^\n]*(?:\n|\Z))+"
+_RULES = rf"(?:(?![^\n]*:[ \t]*$|[ \t]*(?:- )?\w+: )[^\n]*{_IF}[^\n]*(?:\n|\Z))+"  # but no keys of YAML
 _DRAFT = re.compile(
-    rf"^[ \t]*>[ \t]+{_IF}[^\n]*"  # a quotation
+    rf"^[ \t]*>[ \t]+(?:{_IF}|\**(?:user|human|question|prompt)\b)[^\n]*"  # a quotation
     rf"|^[^\w\n\"']*(?:[❌✗✘]|(?:an? )?(?:wrong|incorrect|bad)(?: \w+)?:)[ \t]+(?=[^\n]*{_IF})[^\n]+"
     r"|^[^\w\n]*(?:(?:an?|the|as)\s+)?"  # rules or a block below a label such as "Wrong:"
     r"(?:wrong|incorrect|bad|do not|don't|never|avoid|not like|instead of|counter-?example)\b"
@@ -29,8 +29,10 @@ _ABOVE = (
     r"|(?:the|my) (?:previous|first|old|earlier|initial|original)\b(?: \w+)?)"
 )
 _WITHDRAWS = re.compile(  # the text above: "Wait, that is wrong."
-    r"(?:(?:wait|hm+|actually|no|oops|sorry|hold on|on second thoughts?|correction|my mistake|but)\b[\s,.!:;–—-]*)*"
-    rf"(?:{_ABOVE}(?: is| was|'s) (?!not )(?:\w+ )?(?:wrong|incorrect|flawed|mistake)"
+    r"(?:(?:wait|hm+|actually|no|oops|sorry|hold on|on second thoughts?|correction|my mistake|but|edit|update|note)"
+    r"\b[\s,.!:;–—-]*)*"
+    rf"(?:{_ABOVE}(?: is| was|'s) (?!not )(?:\w+ )?"
+    r"(?:wrong|incorrect|flawed|mistaken?|obsolete|outdated|superseded|invalid)"
     rf"|{_ABOVE} (?:(?:is|was|does) not|(?:is|was|does)n't) (?:\w+ )?(?:right|correct|work)"
     rf"|(?:please )?(?:scratch|strike|ignore|disregard|discard|forget)(?: all| about| of)* {_ABOVE}"
     r"|let me (?:start over|(?:start|try) (?:this |that |it )?again|(?:redo|rewrite|correct|fix|revise)"
@@ -107,12 +109,12 @@ def without_drafts(text: str, notes: list[Note]) -> str:
 
 
 def _lines(text: str) -> list[_Line]:
-    """Return the lines of a text; those inside fences and comments of code are blank."""
+    """Return the lines of a text; those inside fences and code are blank."""
     text = re.sub(rf"(?m)^{_BLOCK}", lambda block: _blank_inside(block[0]), text)
     is_code = _CODE.search(text) is not None
     lines, start = list[_Line](), 0
     for written in text.splitlines(keepends=True):
-        line = "" if is_code and written.lstrip().startswith("#") else written.rstrip()
+        line = "" if is_code and written[:1] in " \t#" else written.rstrip()
         title = None if _ITEM.match(line) or _BEGINS.match(line) or len(line) > 200 else _TITLE.fullmatch(line)
         level = 0 if title is None else len(title["level"]) if title["level"] else 7 if title["bold"] else 8
         lines.append(_Line(start, line, level))

@@ -85,6 +85,7 @@ class DecodedPlan:
         return self.plan is not None and self.scripted is not None and len(self.scripted.steps) == len(self.plan.steps)
 
 
+_CODE_SPAN = re.compile(r"(?<![`\w])`([^`\n]* [^`\n]*)`(?![`\w])")  # not of one word, such as a task's name
 # Typographic characters that models write instead of ASCII characters; an empty string deletes the character.
 _PUBLISHED = re.compile(r'^- When [^“”„«]*, (?:the robot should|move the robot)|check\("', re.MULTILINE)
 _TYPOGRAPHY = str.maketrans(
@@ -94,7 +95,7 @@ _TYPOGRAPHY = str.maketrans(
 _CLAUSES = re.compile(
     r"[^.;:,!?]*:|[^\w' -]+|\s-+\s|\b(?:and|or|then|but|otherwise|else|if|when|whenever|while|until|unless|once|because"
     r"|so that [^.,;]*|\w+ (?:phase|stage)|keep \w+ing(?= (?:until|while))|in case|provided"
-    r"|(?:for )?as (?:long|soon) as|instead|finally|should|must|do\b.*|step\b.*|keep doing"
+    r"|(?:for )?as (?:long|soon) as|instead|finally|should|must|could|may|might|will|would|do\b.*|step\b.*|keep doing"
     r"|(?:go|start)\b.* (?:step|again).*)\b",
     re.IGNORECASE,
 )
@@ -148,7 +149,7 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
     text = without_drafts(without_thoughts(text, notes), notes)
     if "\n" not in text.strip():
         text = text.replace("\\n", "\n")  # two characters that stand for a new line
-    text = text if _PUBLISHED.search(text) else _plain_characters(text)
+    text = _CODE_SPAN.sub(r"\1", text if _PUBLISHED.search(text) else _plain_characters(text))
     if len(text) > _LONGEST:
         notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the remaining {len(text)} characters are not read"))
     reading, section = read_any(text[:_LONGEST], mapper, read)
@@ -157,7 +158,7 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
         del section.clauses[MOST_STEPS:]
     listed = listed_steps(section.listed, len(section.clauses)) or [""] * len(section.clauses)
     clauses = [  # a clause may have a goal instead of a skill
-        clause if clause.skill else replace(clause, skill=words or _as_skill(clause.goal))
+        clause if clause.skill else replace(clause, skill=words or _as_skill(clause.goal, mapper))
         for clause, words in zip(section.clauses, listed, strict=True)
     ]
     steps = [_mapped(clause, mapper, notes) for clause in clauses]
@@ -202,7 +203,7 @@ def _unread(text: str, said: Sequence[str], known: Collection[int]) -> list[Note
             if 1 < len(phrase.split()) <= 40 and is_verb(phrase.split()) and not is_said(phrase):
                 notes.append(Note(number, f"no step has the action {shown(phrase)}"))
         item = None if number in known or len(notes) > noted else PATTERNS["item"].match(line)
-        is_short = item is not None and 2 < len(item[3].split()) <= 40
+        is_short = item is not None and 1 < len(item[3].split()) <= 40
         if item and is_short and not PATTERNS["restarts"].match(item[3]) and {c.kind for c in cut(item[3])} == {"say"}:
             notes.append(Note(number, f"the line is not read: {shown(line.strip())}"))
     return notes[:_MOST_NOTES]
@@ -270,8 +271,10 @@ def decode_program(program: str | Node, task: Task, library: Mapping[str, str] |
     return decode_as(" ", read, mapper)
 
 
-def _as_skill(goal: str) -> str:
+def _as_skill(goal: str, mapper: StepMapper) -> str:
     """Convert a goal to a skill: "the robot's gripper is above mug" gives "move gripper above mug"."""
+    if " is " not in goal and (query := mapper.query(goal).query) is not None:
+        goal = str(query)  # "gripper above mug"
     skills = []
     for state in re.split(r"\s+and\s+", goal):
         match = re.match(r"(?:the\s+)?(?:robot's\s+)?(.+?)\s+is\s+(.+)", state)

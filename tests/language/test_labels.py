@@ -39,6 +39,10 @@ SIDE_BY_SIDE = {
     "then": f"If {C} then {S}, if {D} then {T}.",
     "colons": f"If {C}: {S}, if {D}: {T}",
     "slash": f"When {C}, {S} / When {D}, {T}",
+    "arrows": f"{C} => {S}\n{D} => {T}",
+    "code spans": f"- Once `{C}`, the robot should `{S}`.\n- Once `{D}`, the robot should `{T}`.",
+    "column of the gripper": f"| When | Gripper | Do |\n|---|---|---|\n| {C} | | {S} |\n| {D} | | {T} |",
+    "column of warnings": f"| If | Do not | Do |\n|---|---|---|\n| {C} | lift it | {S} |\n| {D} | push it | {T} |",
 }
 RULES = f"1. If {C}, {S}.\n2. If {D}, {T}.\n\n"
 ASIDES = {
@@ -55,6 +59,27 @@ ASIDES = {
 def steps(text):
     plan = lw.decode_plan(text, "drawer-open").plan
     return [] if plan is None else [(str(step.condition), step.skill) for step in plan.steps]
+
+
+def test_a_block_below_an_if_with_not_is_its_branch():
+    text = f"If the gripper is not open:\n    {S}\nElse:\n    {T}"
+    assert steps(text) == [("the robot's gripper is not open", S), ("the robot's gripper is open", T)]
+
+
+def test_a_column_of_a_table_may_state_what_the_gripper_is():
+    text = f"| When | Gripper | Do |\n|---|---|---|\n| {C} | closed | {S} |"
+    assert steps(text) == [(f"{PLAN[0][0]} and the robot's gripper is closed", S)]
+
+
+def test_forbidden_rules_in_yaml_are_left_out_by_name():
+    text = f"rules:\n- when: {C}\n  do: {S}\nnever:\n- when: {D}\n  do: {T}"
+    assert steps(text) == PLAN[:1]
+    assert any("'never' forbids it" in note.text for note in lw.decode_plan(text, "drawer-open").notes)
+
+
+def test_a_rule_in_json_may_have_a_goal_instead_of_an_action():
+    text = '{"rules": [{"when": "gripper open", "goal": "gripper near drawer handle"}]}'
+    assert steps(text) == [("the robot's gripper is open", "move the gripper near the drawer handle")]
 
 
 @pytest.mark.parametrize("name", LABELLED)

@@ -96,13 +96,19 @@ def labelled_rules(text: str) -> str:
     lines = text.splitlines()
     rules = list(_rules(lines))
     counts = Counter(place for each in rules for place in each.places)
-    for each in rules:
-        (bullet, indent, above), *others = sorted(each.places)
+
+    def may_be_yaml(rule: _Rule) -> bool:
+        (bullet, indent, above), *others = sorted(rule.places)
         key = _KEY.fullmatch(lines[above]) if bullet and above >= 0 else None
         is_single = counts[bullet, indent, above] < 2 and (key is not None or not bullet)
         is_sequence = key is not None and role_of(key[0].strip(" -:")) == "sequence"
-        if not each.is_marked and (others or is_single or is_sequence or (indent and not bullet)):
+        return bool(others or is_single or is_sequence or (indent and not bullet))
+
+    is_yaml = any(not each.is_marked and may_be_yaml(each) for each in rules)
+    for each in rules:
+        if is_yaml and not each.is_marked:
             continue
+        indent = min(each.places, key=lambda place: place[:1])[1]
         title = _TITLE.fullmatch(lines[each.above]) if each.above >= 0 else None
         if title is not None and " " in title[1] and is_command(title[1]):
             lines[each.above] = ""  # "Step 1: Approach the puck"

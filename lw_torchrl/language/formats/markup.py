@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 
 from lw_torchrl.language.formats.base import PROGRAM_WORDS
+from lw_torchrl.language.formats.phrases import is_noun
 
 _LONGEST = 2_000  # maximum length of a line to read (characters), which bounds the time
 BULLET = re.compile(r"\s*(?:[-*•–+>①-⑳]|\(?\[?\d{1,3}[.)\]]|[a-z]\))\s+")
@@ -89,7 +90,7 @@ def _is_rule(line: str) -> bool:
 
 def _tables(lines: list[str]) -> None:
     columns: tuple[int, int] | None = None
-    is_table = False
+    is_table, heads, nouns = False, list[str](), list[int]()
     for number, line in enumerate(lines):
         row = line.strip()
         if is_table and row[:2] in ("+-", "+="):
@@ -104,7 +105,8 @@ def _tables(lines: list[str]) -> None:
         if not is_table:
             heads = [_bare(cell) for cell in cells]
             conditions = [at for at, head in enumerate(heads) if re.match(rf"{_CONDITION}\b", head, re.IGNORECASE)]
-            actions = [at for at, head in enumerate(heads) if re.match(rf"{_ACTION}\b", head, re.IGNORECASE)]
+            actions = [at for at, head in enumerate(heads) if re.match(rf"{_ACTION}\b(?! not)", head, re.IGNORECASE)]
+            nouns = [at for at, head in enumerate(heads) if is_noun(head) and at not in (*conditions, *actions)]
             columns = (conditions[0], actions[0]) if conditions and actions else (0, 1) if len(cells) == 2 else None
             is_table = True
             if columns is not None and (conditions or actions):
@@ -113,4 +115,8 @@ def _tables(lines: list[str]) -> None:
         if columns is None:
             continue
         is_row = len(cells) > max(columns) and re.search(r"\w", row)
-        lines[number] = rule_sentence(cells[columns[0]], cells[columns[1]]) if is_row else ""
+        states = [
+            cells[columns[0]],
+            *(f"the {heads[at]} is {cells[at]}" for at in nouns if re.search(r"\w", cells[at])),
+        ]
+        lines[number] = rule_sentence(" and ".join(states), cells[columns[1]]) if is_row else ""

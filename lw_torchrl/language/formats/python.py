@@ -234,6 +234,9 @@ class PythonReading(Reading):
         self.blocks.append(_Block(indent, number, condition))
         if call := _CALL.match(rest):
             self.call(number, indent + 1, rest, call)
+            _, _, more = rest.partition("); ")
+            if more:
+                self.note_control(number, f"{shown(more)} is left out")
 
     def condition(self, number: int, code: str, at: int) -> tuple[str | None, str]:
         """Parse an ``if``; return its condition (None if it cannot be parsed) and the code after its colon."""

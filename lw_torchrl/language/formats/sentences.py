@@ -34,7 +34,8 @@ class SentenceReading(Reading):
         self.levels = list[tuple[float, int]]()  # the indent of each line above, and the number of scopes at its start
         if PATTERNS["to_step"].search(text) is None:
             text = PATTERNS["numbered_rule"].sub(r"\1- ", text)  # "1. the gripper is open -> close it"
-        lines = _unwrapped(PATTERNS["arrow"].sub(lambda arrow: f"{arrow[1] or ':'} ", text).splitlines())
+        lines = _unwrapped(text.splitlines())
+        lines = [PATTERNS["arrow"].sub(lambda arrow: f"{arrow[1] or ':'} ", line) for line in lines]
         for line in lines:
             self.content(line[:_LONGEST].strip(" -*•"))  # definitions may follow their use
         for self.line, line in enumerate(lines, 1):
@@ -122,6 +123,7 @@ def _unwrapped(lines: list[str]) -> list[str]:
         words = line.split()
         goes_on = number and PATTERNS["wrapped"].search(lines[number - 1]) and not PATTERNS["item"].match(line)
         begins = not words or not words[0][0].islower() or is_verb(words) or PATTERNS["line_start"].match(words[0])
+        begins = begins or PATTERNS["arrow"].search(line)
         is_open = number and len(lines[number - 1]) > 30 and PATTERNS["line_end"].search(lines[number - 1]) is None
         if words and (goes_on or (is_open and not begins)) and len(joined[first]) < _LONGEST:
             joined[first] += f" {line.strip()}"

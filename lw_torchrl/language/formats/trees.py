@@ -62,7 +62,7 @@ from lw_torchrl.language.formats.shapes import (
     values_in,
 )
 from lw_torchrl.language.formats.values import parse_value
-from lw_torchrl.language.polarity import instruction
+from lw_torchrl.language.polarity import forbids, instruction
 from lw_torchrl.language.programs import (
     Action,
     Block,
@@ -84,6 +84,7 @@ _KINDS = (*_JOINS, "loop")
 _LABELS = ("name", "comment", "start", "type")
 _PROSE = re.compile(r"[.;?] +\w|, *(?:if|unless|otherwise)\b", re.IGNORECASE)
 _SENTENCE = re.compile(r"(?:if|when|unless|otherwise|while)\b.*[,:]", re.IGNORECASE)
+_LEAD = re.compile(r"\s*(?:if|when|whenever|while|once)\s+(?=\w+ )", re.IGNORECASE)
 _CONDITIONAL = re.compile(r"\b(?:if|when|unless|otherwise|while)\b", re.IGNORECASE)
 _AND_OR = re.compile(r"\s*(?:\band\b|\bor\b|\bnot\b|[()&|!]+)\s*", re.IGNORECASE)
 
@@ -254,6 +255,7 @@ class _Tree:
 
     def said(self, text: str) -> Expression:
         """Convert a text to a condition; a name that the text defines stands for its definition."""
+        text = _LEAD.sub("", text)
         self.conditions.add(text)
         if self.is_defined(text):
             return _condition(self.leaf(text, "test"))
@@ -328,8 +330,10 @@ class _Tree:
             key, role, truth = str(name), role_of(str(name)), truth_of(value)
             text = plain(value.split(".")[-1]) if isinstance(value, str) else ""
             texts = value if isinstance(value, list) else [value]
-            is_command_alone = role != "else" and all(isinstance(each, str) and is_command(each) for each in texts)
-            if is_command_alone and not instruction(plain(key)).text:
+            is_rule = role == "else" or _CONDITIONAL.match(key) is not None or is_statement(key)
+            is_forbidden = all(isinstance(each, str) and is_command(each) for each in texts)
+            is_forbidden |= forbids(plain(key)) and any(map(has_action, texts))  # {"do_not": [{"when": ...}]}
+            if is_forbidden and not is_rule and not instruction(plain(key)).text:
                 self.reading.note(self.line(key), f"{shown(value)} is left out: {shown(key)} forbids it")
                 continue  # {"never": "close the gripper"}
             if place and plain(key) in ("elif", "else if", "elseif"):
@@ -380,6 +384,7 @@ class _Tree:
     def branch(self, fields: dict[str, Any], hint: str, kind: str) -> Node | None:
         """Convert a JSON object to a program in which the object's conditions guard its actions."""
         tests, bodies, otherwise, until = list[Expression](), list[Node](), list[Node](), None
+        row = fields
         join = kind if kind in _JOINS else ""
         labels = [value for key, value in fields.items() if role_of(key) == "name" and isinstance(value, str)]
         if any(map(is_told, labels)):  # {"shape": "box", "label": "close the gripper"}
@@ -426,6 +431,9 @@ class _Tree:
                     bodies.append(node)
                 else:
                     tests.append(_condition(node))
+        goals = [each for key, each in row.items() if is_goal(key) and isinstance(each, str) and states(each)]
+        if tests and goals and hint != "test" and not (bodies or otherwise):
+            bodies.append(Action("", self.line(goals[0]), goals[0]))  # {"when": ..., "goal": ...}
         if join and not bodies:
             bodies, tests = [Check(test) for test in tests], []
         body = _joined(bodies, join or ("" if any(map(_is_guarded, bodies)) else "sequence"))
