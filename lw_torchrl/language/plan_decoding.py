@@ -157,8 +157,8 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
         reading.note(further[0].line, f"the plan has more than {MOST_STEPS} steps; {len(further)} are left out")
         del section.clauses[MOST_STEPS:]
     listed = listed_steps(section.listed, len(section.clauses)) or [""] * len(section.clauses)
-    clauses = [  # a clause may have a goal instead of a skill
-        clause if clause.skill else replace(clause, skill=words or _as_skill(clause.goal, mapper))
+    clauses = [  # a clause may have a goal instead of a skill, or a skill in quotes
+        replace(clause, skill=clause.skill.strip('"') or words or _as_skill(clause.goal, mapper))
         for clause, words in zip(section.clauses, listed, strict=True)
     ]
     steps = [_mapped(clause, mapper, notes) for clause in clauses]
@@ -290,7 +290,8 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
     def note(text: str) -> None:
         notes.append(Note(clause.line, text))
 
-    guard = as_expression(one_line(clause.condition) if isinstance(clause.condition, str) else clause.condition)
+    said = clause.condition
+    guard = as_expression(one_line(said).strip('"') if isinstance(said, str) else said)  # When "...", ...
     count = count_mentions(guard)
     written = str(guard) if count <= MOST_CLAUSES else f"a condition with {count} parts"
     condition, distance, unknown = _mapped_guard(clause, guard, mapper, notes)
