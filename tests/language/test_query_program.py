@@ -251,7 +251,7 @@ def test_shared_parts_are_one_gate():
     tables, shapes = compile_queries({TASKS["stick-pull"]: [Query(tip), Query(negate(tip))]})
     assert sum(gates for *_, gates in shapes) <= 30 * 65 + 2
     assert tables.inputs.shape[1] < 500_000
-    assert time.process_time() - started < 2.0
+    assert time.process_time() - started < 8.0  # without sharing, 2^30 gates
 
 
 def test_the_logits_of_a_disjunction_and_a_negation():

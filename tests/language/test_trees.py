@@ -249,11 +249,11 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_hostile_values_are_read_within_a_second(name):
+def test_hostile_values_are_read_within_seconds(name):
     start = process_time()
     reading = TreeReading(HOSTILE[name])
     assert reading.error or name in ("yaml", "names")
-    assert process_time() - start < 1.0
+    assert process_time() - start < 5.0  # 0.5 s on a quiet machine; following every reference would never end
 
 
 def test_values_as_models_write_them():
