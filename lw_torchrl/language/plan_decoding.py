@@ -86,8 +86,8 @@ class DecodedPlan:
 
 
 _CODE_SPAN = re.compile(r"(?<![`\w])`([^`\n]* [^`\n]*)`(?![`\w])")  # not of one word, such as a task's name
-# Typographic characters that models write instead of ASCII characters; an empty string deletes the character.
 _PUBLISHED = re.compile(r'^- When [^“”„«]*, (?:the robot should|move the robot)|check\("', re.MULTILINE)
+# Typographic characters that models write instead of ASCII characters; an empty string deletes the character.
 _TYPOGRAPHY = str.maketrans(
     {**dict.fromkeys("“”„‟«»", '"'), **dict.fromkeys("\u200b\u200c\u200d\u2060\ufeff\xad\ufe0f", ""), "\u20e3": ")"}
     | {"\xa0": " ", "\u202f": " ", "\u2011": "-", "－": "-", "，": ", ", "。": ". ", "：": ": ", "；": "; "}
@@ -151,7 +151,7 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
         text = text.replace("\\n", "\n")  # two characters that stand for a new line
     text = _CODE_SPAN.sub(r"\1", text if _PUBLISHED.search(text) else _plain_characters(text))
     if len(text) > _LONGEST:
-        notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the remaining {len(text)} characters are not read"))
+        notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the remaining {len(text) - _LONGEST} characters are not read"))
     reading, section = read_any(text[:_LONGEST], mapper, read)
     if further := section.clauses[MOST_STEPS:]:
         reading.note(further[0].line, f"the plan has more than {MOST_STEPS} steps; {len(further)} are left out")

@@ -431,9 +431,9 @@ class _Tree:
                     bodies.append(node)
                 else:
                     tests.append(_condition(node))
-        goals = [each for key, each in row.items() if is_goal(key) and isinstance(each, str) and states(each)]
-        if tests and goals and hint != "test" and not (bodies or otherwise):
-            bodies.append(Action("", self.line(goals[0]), goals[0]))  # {"when": ..., "goal": ...}
+        if tests and hint != "test" and not (bodies or otherwise):  # {"when": ..., "goal": ...}
+            goals = [each for key, each in row.items() if is_goal(key) and isinstance(each, str) and states(each)]
+            bodies += [Action("", self.line(goal), goal) for goal in goals[:1]]
         if join and not bodies:
             bodies, tests = [Check(test) for test in tests], []
         body = _joined(bodies, join or ("" if any(map(_is_guarded, bodies)) else "sequence"))
