@@ -151,7 +151,9 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
         text = text.replace("\\n", "\n")  # two characters that stand for a new line
     text = _CODE_SPAN.sub(r"\1", text if _PUBLISHED.search(text) else _plain_characters(text))
     if len(text) > _LONGEST:
-        notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the remaining {len(text) - _LONGEST} characters are not read"))
+        notes.append(
+            Note(text.count("\n", 0, _LONGEST) + 1, f"the remaining {len(text) - _LONGEST} characters are not read")
+        )
     reading, section = read_any(text[:_LONGEST], mapper, read)
     if further := section.clauses[MOST_STEPS:]:
         reading.note(further[0].line, f"the plan has more than {MOST_STEPS} steps; {len(further)} are left out")
