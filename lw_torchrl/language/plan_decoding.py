@@ -160,7 +160,7 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
         del section.clauses[MOST_STEPS:]
     listed = listed_steps(section.listed, len(section.clauses)) or [""] * len(section.clauses)
     clauses = [  # a clause may have a goal instead of a skill, or a skill in quotes
-        replace(clause, skill=clause.skill.strip('"') or words or _as_skill(clause.goal, mapper))
+        replace(clause, skill=_unquoted(clause.skill) or words or _as_skill(clause.goal, mapper))
         for clause, words in zip(section.clauses, listed, strict=True)
     ]
     steps = [_mapped(clause, mapper, notes) for clause in clauses]
@@ -273,6 +273,11 @@ def decode_program(program: str | Node, task: Task, library: Mapping[str, str] |
     return decode_as(" ", read, mapper)
 
 
+def _unquoted(text: str) -> str:
+    """Remove the quotation marks around a text, but not those of words in it."""
+    return text.strip('"') if text.startswith('"') else text
+
+
 def _as_skill(goal: str, mapper: StepMapper) -> str:
     """Convert a goal to a skill: "the robot's gripper is above mug" gives "move gripper above mug"."""
     if " is " not in goal and (query := mapper.query(goal).query) is not None:
@@ -293,7 +298,7 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
         notes.append(Note(clause.line, text))
 
     said = clause.condition
-    guard = as_expression(one_line(said).strip('"') if isinstance(said, str) else said)  # When "...", ...
+    guard = as_expression(_unquoted(one_line(said)) if isinstance(said, str) else said)  # When "...", ...
     count = count_mentions(guard)
     written = str(guard) if count <= MOST_CLAUSES else f"a condition with {count} parts"
     condition, distance, unknown = _mapped_guard(clause, guard, mapper, notes)
