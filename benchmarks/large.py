@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import resource
+import re
 import subprocess
 import sys
 from itertools import pairwise
@@ -20,6 +20,7 @@ from benchmarks.report import Row, Settings, times_as_long, under
 
 STEPS = 500
 PARTS = {"environments": ("construction", "reset", "first step", "later step"), "rows": ("construction", "first batch")}
+LATER = 5  # the number of steps after the first
 GROWTH = 8  # the ratio of the large number to the small one
 MOST = 1.3  # the maximum ratio of the times per environment or row
 
@@ -45,17 +46,24 @@ def write_dataset(root: Path, rows: int) -> None:
     dataset.write_metadata(dataset.Demonstrations(root, config, {}, ids, infos, attempts))
 
 
+def peak() -> float:
+    """Return the peak memory of this process in GB, without that of the process which started it."""
+    return int(re.findall(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text("ascii"))[0]) / 1e6
+
+
 def measure(kind: str, number: int, root: str) -> dict[str, float]:
     """Return the CPU seconds for each part on one thread, and the memory in GB without the imports."""
-    times, before = [process_time()], resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    times, before = [process_time()], peak()
     if kind == "environments":
         env = lw.LanguageWorldEnv("MT50", num_envs=number, num_threads=1)
         times.append(process_time())
         state = env.reset()
         times.append(process_time())
-        for _ in range(2):
+        state = env.step(env.rand_action(state))["next"]
+        times.append(process_time())
+        for _ in range(LATER):
             state = env.step(env.rand_action(state))["next"]
-            times.append(process_time())
+        times.append(times[-1] + (process_time() - times[-1]) / LATER)
     else:
         transform = lw.QAFTransform(lw.load_plans("MT50"))
         replay = lw.LanguageWorldExperienceReplay(
@@ -65,8 +73,7 @@ def measure(kind: str, number: int, root: str) -> dict[str, float]:
         replay.sample()
         times.append(process_time())
     seconds = (end - start for start, end in pairwise(times))
-    memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6
-    return dict(zip(PARTS[kind], seconds, strict=True)) | {"memory": memory}
+    return dict(zip(PARTS[kind], seconds, strict=True)) | {"memory": peak() - before}
 
 
 def large(settings: Settings) -> list[Row]:
