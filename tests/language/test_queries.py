@@ -2,7 +2,6 @@
 
 import pickle
 import re
-import time
 from copy import deepcopy
 
 import language_world as oracle
@@ -10,6 +9,7 @@ import pytest
 from conditions import query_of, text_of, trees
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from speed import within
 
 from lw_torchrl.language.expressions import all_of, any_of, count_mentions, negate
 from lw_torchrl.language.nearest import nearest_query
@@ -190,10 +190,8 @@ def test_any_text_is_a_query_or_a_query_error(text, task):
     ids=["letters", "articles", "ands", "parentheses", "groups", "depth", "clauses", "negations", "spaces", "marks"],
 )
 def test_a_very_long_text_fails_in_time(text):
-    started = time.perf_counter()
-    with pytest.raises(QueryError):
+    with within(5), pytest.raises(QueryError):
         parse_query(text, "stick-pull")
-    assert time.perf_counter() - started < 5.0
 
 
 def test_a_query_has_at_most_256_clauses():
@@ -206,18 +204,17 @@ def test_a_query_has_at_most_256_clauses():
 
 
 def test_an_expression_of_exponential_length_is_refused_in_time():
-    started = time.process_time()
-    clauses = [parse_query(text, "stick-pull").expression for text in supported_queries("stick-pull")[::2][:64]]
-    tip = clauses[0]
-    for level in range(30):
-        tip = (all_of if level % 2 else any_of)(
-            [(any_of if level % 2 else all_of)([tip, each]) for each in clauses[1:]]
-        )
-        tip = negate(tip)
-    assert count_mentions(tip) > 10**9
-    with pytest.raises(QueryError, match="at most 256 clauses"):
-        check_query(Query(tip), "stick-pull")
-    assert time.process_time() - started < 1.0
+    with within(1):
+        clauses = [parse_query(text, "stick-pull").expression for text in supported_queries("stick-pull")[::2][:64]]
+        tip = clauses[0]
+        for level in range(30):
+            tip = (all_of if level % 2 else any_of)(
+                [(any_of if level % 2 else all_of)([tip, each]) for each in clauses[1:]]
+            )
+            tip = negate(tip)
+        assert count_mentions(tip) > 10**9
+        with pytest.raises(QueryError, match="at most 256 clauses"):
+            check_query(Query(tip), "stick-pull")
 
 
 @pytest.mark.parametrize(
