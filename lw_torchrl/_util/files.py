@@ -271,7 +271,8 @@ def _finite(text: str) -> float:
 
 
 def check_damage(error: Exception) -> None:
-    """Re-raise ``error`` if its cause is a limit of the system, such as too many open files, not a damaged file."""
+    """Re-raise ``error`` if it was caused by a system limit, such as too many open files, rather than by a damaged
+    file."""
     expected = (None, errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EINVAL)
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno not in expected):
         raise error

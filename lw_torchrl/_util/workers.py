@@ -56,7 +56,8 @@ def start_early(workers: int | None, time_steps: int) -> None:
 
 
 def split(episodes: Episodes, workers: int, largest: int) -> list[dict[str, list[int]]]:
-    """Split episodes into parts of equal size: at least one part per worker, and at most ``largest`` episodes per part.
+    """Split episodes into parts of nearly equal size: at least one part per worker if there are enough, and at most
+    ``largest`` episodes per part.
 
     A part contains few tasks, because each task takes time to set up.
     """

@@ -215,7 +215,9 @@ def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> 
     if isinstance(evaluator, lw.QueryEvaluator):
         return evaluator.with_plans(plans)
     if not (isinstance(evaluator, type) and issubclass(evaluator, lw.QueryEvaluator)):
-        raise ValueError(f"--evaluator {name} must be a lw.QueryEvaluator or a subclass, got {evaluator!r:.80}")
+        raise ValueError(
+            f"--evaluator {name} must be an instance or a subclass of lw.QueryEvaluator, got {evaluator!r:.80}"
+        )
     return evaluator(plans)
 
 

@@ -63,7 +63,7 @@ class DatasetStorage(TensorStorage):
         return rows if isinstance(index, Tensor) and index.dim() else rows.clone(recurse=not isinstance(index, slice))
 
     def add_column(self, name: NestedKey, values: Tensor) -> None:
-        """Add a column with one value (R, ...) per row."""
+        """Add a column of values (R, ...), one for each of the R rows."""
         self._storage.set(name, values)
 
     def set(self, *args: Any, **kwargs: Any) -> NoReturn:

@@ -1,4 +1,4 @@
-"""PlanUse: measure how often each plan step's condition holds and is chosen, and where failed episodes get stuck."""
+"""PlanUse: measure how often each plan step is chosen and its condition holds, and where failed episodes get stuck."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class Line:
 
 
 def outline(guards: Sequence[Any]) -> list[Line]:
-    """Arrange the steps of a plan by the conditions that consecutive steps share.
+    """Arrange the steps of a plan as an outline, by the conditions that consecutive steps share.
 
     A step's condition is the conjunction of the branch heads above the step. "else" negates the preceding branches at
     the same depth.

@@ -1,4 +1,5 @@
-"""Conditional plans: (condition, skill) pairs in English. :mod:`lw_torchrl.language.formats` has their text formats."""
+"""Conditional plans: (condition, skill) pairs in English. :mod:`lw_torchrl.language.formats` defines their text
+formats."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Done:
-    """A leaf of a condition, which is true if an action has had its effect."""
+    """A leaf of a condition, which is true once an action has taken effect."""
 
     text: str  # the action's text
 

@@ -57,7 +57,7 @@ class Atom(NamedTuple):
 
     @property
     def flipped(self) -> bool:
-        """Whether the atom is true where its value is not below the threshold."""
+        """True if the atom holds when its value is at or above the threshold, instead of below it."""
         return self.part.sense == "<="
 
 

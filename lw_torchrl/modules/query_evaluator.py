@@ -297,7 +297,7 @@ class ClauseEvaluator(QueryEvaluator):
 
 def _different(argument: str, names: Sequence[str]) -> tuple[str, ...]:
     if isinstance(names, str) or not names or len({*names}) < len(names):
-        raise ValueError(f"{argument} must be at least one name, without duplicates, got {shown(names)}")
+        raise ValueError(f"{argument} must be one or more distinct names, got {shown(names)}")
     return tuple(names)
 
 

@@ -246,8 +246,8 @@ class RoleFeatures(_RelativePositions):
         self._sharing = WeakSet([self])
 
     def with_plans(self, plans: AnyPlans) -> RoleFeatures:
-        """Return features for different plans. For common tasks, both always have the same contacts, even if one of
-        them is fitted later."""
+        """Return features for different plans. For tasks that both sets of plans contain, the two modules always share
+        their contact points, even if one module is fitted later."""
         other: RoleFeatures = super().with_plans(plans)
         other._sharing = self._sharing
         other._sharing.add(other)

@@ -194,7 +194,7 @@ def _answers_in_folder(root: Path) -> Iterator[tuple[str, _Place, Path]]:
 
 
 def _answers_in_lines(file: Path) -> Iterator[tuple[str, _Place, str]]:
-    """Yield (model, place, text) for each line of a .jsonl file."""
+    """Yield (model, (format, task, attempt), text) for each line of a .jsonl file."""
     models: dict[str, str] = {}
     for number, line in enumerate(read_text(file, ValueError).split("\n"), 1):
         if not line.strip():

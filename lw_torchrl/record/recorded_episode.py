@@ -155,7 +155,7 @@ class RecordedEpisode:
         layout: Layout | None = METAWORLD,
         step_time: float = STEP_TIME,
     ) -> RecordedEpisode:
-        """Validate a rollout, which :meth:`lw_torchrl.RerunLogger.log_episode` describes, and return the episode."""
+        """Validate a rollout and return the episode; see :meth:`lw_torchrl.RerunLogger.log_episode` for the keys."""
         if len(rollout.batch_size) != 1 or not rollout.batch_size[0]:
             hint = "; select one episode, rollout[i]" if len(rollout.batch_size) > 1 else ""
             raise ValueError(f"rollout must have batch size (T,) with T >= 1, got {tuple(rollout.batch_size)}{hint}")

@@ -130,7 +130,7 @@ class CapturedFunction:
 
 
 def _watched(call: Callable[[], Any], module: Any) -> tuple[Any, str]:
-    """Return the result of a call, and the first place where it waited for the device ("" for none)."""
+    """Return the result of a call, and the first source line that waited for the device ("" if none did)."""
     before, places = module.get_sync_debug_mode(), list[str]()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -212,7 +212,8 @@ def _draw_tasks(held_out: int | tuple[str, ...], names: Sequence[str], generator
 
 
 def _draw_pairs(fraction: float, tasks: Sequence[Task], generator: torch.Generator) -> tuple[tuple[str, str], ...]:
-    """Draw a fraction of the pairs of distinct objects: at least one pair, unless the fraction is 0."""
+    """Draw a fraction of the pairs of distinct objects: at least one pair unless the fraction is 0, but never all
+    pairs."""
     clauses = chain.from_iterable(base_clauses(task, ("near",)) for task in tasks)
     pairs = sorted({_pair(clause) for clause in clauses if clause.object is not None})
     number = min(len(pairs) - 1, max(1, round(fraction * len(pairs)))) if fraction else 0

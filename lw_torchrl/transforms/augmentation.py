@@ -77,10 +77,11 @@ class PlanAugmentation(Augmentation):
 
 
 class SwapUnmentioned(PlanAugmentation):
-    """An augmentation that takes the positions of objects that no active plan step mentions from another row.
+    """An augmentation that gives each object not mentioned by an active plan step its position in a random row.
 
-    A policy then cannot rely on these objects. A plan step mentions the objects, and the goal, that are named in the
-    step's condition or skill. For replay buffers, after a :class:`QAFTransform`, which must see the unchanged scene.
+    This keeps a policy from relying on these objects. A plan step mentions an object, or the goal, if the step's
+    condition or skill names it. Use this transform in a replay buffer, after a :class:`QAFTransform`, which must see
+    the unchanged scene.
 
     Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); changes ``observation`` (B, D) and ``("next", "observation")`` in
     the same way. An object keeps its position if a step that is active in either observation mentions it. Draws from

@@ -47,7 +47,7 @@ def turn_observation(observation: Tensor, angle: Tensor, layout: Layout = METAWO
 
 
 def turn_vectors(vectors: Tensor, angle: Tensor) -> Tensor:
-    """Rotate vectors (..., 3) about the vertical axis by (...) radians."""
+    """Rotate vectors (..., 3) about the vertical axis by angles (...) in radians."""
     return _turned(vectors, (0,), angle.cos(), angle.sin())
 
 

@@ -308,7 +308,7 @@ def _same(column: Array) -> Array:
 
 
 def _listed(meta: Path, kind: str) -> dict[int, dict[str, Any]]:
-    """Read LeRobot's list of "episodes" or "tasks" by their number, from JSON lines or parquet files."""
+    """Read LeRobot's list of "episodes" or "tasks" from JSON Lines or Parquet files, by index."""
     import pyarrow.parquet as pq
 
     names = ("episode_index", "length", "tasks", "task_index", "name", "task", "__index_level_0__")

@@ -54,7 +54,8 @@ _START = re.compile(r"\s*(?:(?:async\s+)?def|class|if|while|for|import|from|@\w+
 
 
 class CodeReading(Reading):
-    """A reader of Python functions, each of which becomes a section with a tree. Incomplete code is repaired."""
+    """A reader of Python code: each function that no other function calls becomes a section with a tree. Incomplete
+    code is repaired."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

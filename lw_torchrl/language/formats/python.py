@@ -329,5 +329,6 @@ def _statements(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _bare(code: str) -> str:
-    """Remove the strings and the comment from a line. Of an unterminated string, the quote remains."""
+    """Remove the string literals and the comment from a line of code; replace an unterminated string with a double
+    quote."""
     return _LITERAL.sub(lambda literal: "" if literal[1] or literal[2] else '"', code).partition("#")[0]

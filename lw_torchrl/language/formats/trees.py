@@ -454,7 +454,7 @@ class Tree:
         return isinstance(value, str) and not is_told(value) and value not in self.definitions
 
     def field(self, key: str, value: Any, role: str, hint: str, join: str) -> Node | None:
-        """Convert a field that is not a condition by its key."""
+        """Convert a field to a program node according to its key."""
         if plain(key) == "nand":
             return self.object({"not": {"all": value}}, hint)
         if role in ("", "test") and is_statement(key):

@@ -285,7 +285,7 @@ class FunnelTerm:
         self._margin = funnel.margin
 
     def __call__(self, features: Array) -> Array:
-        """Return values (rows,): 1 above the floor, and less than 1 below the floor."""
+        """Return values (rows,): 1 above the floor and up to 1 cm below it, and less than 1 further below."""
         above = np.ones(len(features))
         if self._rows.size:
             numbers = features.reshape(-1)

@@ -264,9 +264,10 @@ class ThreadedEngine(SeenRows):
             self._compiled = CompiledRows(kernel, self._rows, [group.rows for group in self._groups])
 
     def _simulate(self, rows: Index, inputs: Array, outputs: Array) -> Mask:
-        """Simulate rows with inputs (rows, K); fill outputs (rows, W) and return whether the rows are stable (rows,).
+        """Simulate rows with inputs (rows, K), fill outputs (rows, W), and return a bool mask (rows,) of the stable
+        rows.
 
-        Without the kernel, Python threads compute bit-identical results, but need ten slow Python calls per row.
+        Without the kernel, Python threads compute bit-identical results, but make ten slow Python calls per row.
         """
         if self._compiled is not None:
             return self._compiled.simulate(rows, inputs, outputs, self._pool.run)
