@@ -13,7 +13,7 @@ _IF = r"\b(?:when|whenever|if|once|unless)\b"
 _RULE = re.compile(rf"^[^\n]*{_IF}|^[ \t]*```\w+$", re.IGNORECASE | re.MULTILINE)
 _RULES = rf"(?:(?![^\n]*:[ \t]*$|[ \t]*(?:- )?\w+: )[^\n]*{_IF}[^\n]*(?:\n|\Z))+"  # but no keys of YAML
 _DRAFT = re.compile(
-    rf"^[ \t]*>[ \t]+(?:{_IF}|\**(?:user|human|question|prompt)\b)[^\n]*"  # a quotation
+    rf"(?:^[ \t]*>[^\n]*(?:\n|\Z))+"  # a quotation
     rf"|^[^\w\n\"']*(?:[❌✗✘]|(?:an? )?(?:wrong|incorrect|bad)(?: \w+)?:)[ \t]+(?=[^\n]*{_IF})[^\n]+"
     r"|^[^\w\n]*(?:(?:an?|the|as)\s+)?"  # rules or a block below a label such as "Wrong:"
     r"(?:wrong|incorrect|bad|do not|don't|never|avoid|not like|instead of|counter-?example)\b"
@@ -53,7 +53,9 @@ _ANNOUNCES = re.compile(  # the plan that replaces the text above: "Here is the 
 _IS_DRAFT = re.compile(  # a heading
     r"\b(?:draft|(?:do not|don't|not to|never) use|discarded|deprecated|obsolete|outdated|rejected|abandoned|superseded"
     rf"|old|(?:first|initial|previous|earlier|original|rough|wrong|incorrect|bad) (?:{_PLAN}|rules)"
-    r"|counter-?examples?)\b|^(?:an |for )?examples?(?: (?:rules?|output|plan))?$",
+    r"|counter-?examples?)\b|^(?:an |for )?examples?(?: (?:rules?|output|plan))?$"
+    r"|^(?:(?:the robot|you|it) )?(?:(?:must|should|may) not|do nots?|don'?ts?|never|avoid|(?:how|what) not to"
+    r"|forbidden|prohibited)\b",
     re.IGNORECASE,
 )
 _ITEM = re.compile(r"\s*(?:[-•+]|\*(?!\*)|\d+[.)])\s")
@@ -103,7 +105,7 @@ def without_drafts(text: str, notes: list[Note]) -> str:
         if _RULE.search(rest) if parts is drafts else any(map(_BEGINS.match, rest.splitlines())):
             spans = merged
     for start, end in spans:
-        reason = "struck out" if text[start] in "~<" else "a draft or a quotation"
+        reason = "struck out" if text[start] in "~<" else "a draft, a quotation or a prohibition"
         notes.append(Note(text.count("\n", 0, start) + 1, f"{reason}: {shown(text[start:end].strip())} is left out"))
     return cut_out(text, spans)
 
@@ -150,7 +152,7 @@ def _draft_sections(lines: list[_Line]) -> list[tuple[int, int]]:
     """Return the spans below headings of drafts, each up to the next heading of the same level."""
     spans = list[tuple[int, int]]()
     for number, line in enumerate(lines):
-        if not (line.level and _IS_DRAFT.search(line.text.strip(_MARKUP))) or _replaces(line):
+        if not (line.level and _IS_DRAFT.search(line.text.replace("*", "").strip(_MARKUP))) or _replaces(line):
             continue
         end = number + 1
         while end < len(lines) and not _ends(line, lines[end]):

@@ -20,6 +20,9 @@ _HANDS = frozenset(" ".join((GRIPPER, *WORDS["canonical"]["hands"], *_NOUNS["han
 _PLACES = frozenset(" ".join((*PREDICATES, *WORDS["canonical"]["place"], *_NOUNS["places"])).split()) - {"the", "table"}
 _GOALS = ("target", "location", "goal", "destination")
 _TOUCHES = re.compile(rf"\b(?:{'|'.join(WORDS['contact'])})\b.*?\btable\b")
+_LENGTH = re.compile(
+    r"\d(?:[\d.]*)? ?(?:mm|cm|m|(?:milli|centi)?met(?:re|er)s?|inch(?:es)?|feet|foot|ft)\b", re.IGNORECASE
+)
 _MOST_WORDS = 40  # maximum number of words of a part of a condition
 
 
@@ -42,6 +45,8 @@ def mentions(text: str, task: Task) -> Mentions:
         'camera'
     """
     text = _TOUCHES.sub("touching", text.replace(" -", " ").strip("-"))
+    if length := _LENGTH.search(text):  # "30 cm above the dial"; a query has its own thresholds
+        return Mentions(None, frozenset((None,)), length[0])
     if len(text.split()) > _MOST_WORDS:
         return Mentions(None, frozenset((None,)), text)
     as_written = _mentions(text, task)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,16 +20,14 @@ from lw_torchrl.language.expressions import (
     replace_leaves,
 )
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, is_verb, listed_steps
-from lw_torchrl.language.formats.clauses import PATTERNS, base_verb
-from lw_torchrl.language.formats.clauses import clauses as cut
+from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, listed_steps
 from lw_torchrl.language.formats.detection import read_any, section_notes
 from lw_torchrl.language.formats.prose import ProseReading
-from lw_torchrl.language.formats.sentences import SentenceReading, usual_words
+from lw_torchrl.language.formats.sentences import SentenceReading
 from lw_torchrl.language.library import expand
 from lw_torchrl.language.nearest import MappedQuery, StepMapper
 from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line
-from lw_torchrl.language.polarity import forbids, instruction
+from lw_torchrl.language.polarity import instruction
 from lw_torchrl.language.programs import (
     Action,
     Block,
@@ -45,6 +43,7 @@ from lw_torchrl.language.skills import Skills, canonical_skill
 from lw_torchrl.language.step_parser import skill_effect
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
 from lw_torchrl.language.thoughts import without_thoughts
+from lw_torchrl.language.unread import Said, unread
 
 
 @dataclass(frozen=True)
@@ -92,13 +91,7 @@ _TYPOGRAPHY = str.maketrans(
     {**dict.fromkeys("“”„‟«»", '"'), **dict.fromkeys("\u200b\u200c\u200d\u2060\ufeff\xad\ufe0f", ""), "\u20e3": ")"}
     | {"\xa0": " ", "\u202f": " ", "\u2011": "-", "－": "-", "，": ", ", "。": ". ", "：": ": ", "；": "; "}
 )
-_CLAUSES = re.compile(
-    r"[^.;:,!?]*:|[^\w' -]+|\s-+\s|\b(?:and|or|then|but|otherwise|else|if|when|whenever|while|until|unless|once|because"
-    r"|so that [^.,;]*|\w+ (?:phase|stage)|keep \w+ing(?= (?:until|while))|in case|provided"
-    r"|(?:for )?as (?:long|soon) as|instead|finally|should|must|could|may|might|will|would|do\b.*|step\b.*|keep doing"
-    r"|(?:go|start)\b.* (?:step|again).*)\b",
-    re.IGNORECASE,
-)
+_FENCED = re.compile(r"^[ \t]*(```|~~~)(?:.*\n)*?[ \t]*(?:\1.*$|\Z)", re.MULTILINE)
 _SECOND_CONDITION = re.compile(r"(?:if|when|whenever|while|once|unless|as long as) \w", re.IGNORECASE)
 _MOST_NOTES = 50  # maximum number of notes on the lines of a text without a plan
 _LONGEST = 65_536  # maximum number of characters to parse
@@ -166,12 +159,10 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
     steps = [_mapped(clause, mapper, notes) for clause in clauses]
     notes += section_notes(reading, section, owner)
     is_prose = isinstance(reading, ProseReading | SentenceReading)
-    skills_said = [clause.skill for clause in clauses]
-    if is_prose or not clauses:
-        notes += _prohibitions(text, [*skills_said, *(note.text for note in notes)])
-    if is_prose and read is None:
-        said = [*skills_said, *(clause.reason for clause in clauses), *(note.text for note in notes)]
-        notes += _unread(text, said, {clause.line for clause in clauses} | {note.line for note in notes})
+    if read is None or is_prose or not clauses:
+        read_text = text if is_prose or not clauses else _outside_code(text)
+        said, reasons = [Said(each.line, each.skill) for each in clauses], [each.reason for each in clauses]
+        notes += unread(read_text, said, reasons, notes, is_prose and read is None)
 
     def plan(skills: Sequence[str | None]) -> ConditionalPlan | None:
         kept = tuple(
@@ -185,54 +176,15 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
     reason = "" if written is not None else _why_none(reading, steps, owner, text)
     if written is None and not steps:
         noted = {note.line for note in notes}
-        unread = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1) if number not in noted]
-        notes += [Note(number, f"the line is not read: {shown(line)}") for number, line in unread if line][:_MOST_NOTES]
+        rest = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1) if number not in noted]
+        notes += [Note(number, f"the line is not read: {shown(line)}") for number, line in rest if line][:_MOST_NOTES]
     return DecodedPlan(written, scripted, reason, tuple(sorted(notes, key=lambda note: note.line)), tuple(steps))
 
 
-def _unread(text: str, said: Sequence[str], known: Collection[int]) -> list[Note]:
-    """Return a note for each action and each item of a list in prose that is in neither a step nor another note.
-
-    Args:
-        said: the texts of the steps and of the notes.
-        known: the numbers of their lines.
-    """
-    is_said = _within(said)
-    notes = list[Note]()
-    for number, line in enumerate(text.splitlines(), 1) if known else ():
-        noted = len(notes)
-        for phrase in (part.strip(" -'") for part in _CLAUSES.split(line[:8_000])):
-            if 1 < len(phrase.split()) <= 40 and is_verb(phrase.split()) and not is_said(phrase):
-                notes.append(Note(number, f"no step has the action {shown(phrase)}"))
-        item = None if number in known or len(notes) > noted else PATTERNS["item"].match(line)
-        is_short = item is not None and 1 < len(item[3].split()) <= 40
-        if item and is_short and not PATTERNS["restarts"].match(item[3]) and {c.kind for c in cut(item[3])} == {"say"}:
-            notes.append(Note(number, f"the line is not read: {shown(line.strip())}"))
-    return notes[:_MOST_NOTES]
-
-
-def _prohibitions(text: str, said: Sequence[str]) -> list[Note]:
-    """Return a note for each clause of prose that forbids an action and is in neither a step nor another note."""
-    is_said, notes = _within(said), list[Note]()
-    for number, line in enumerate(text.splitlines(), 1):
-        line = re.sub(r"^[\W\d]+|\*", "", line[:8_000])
-        for clause in cut(usual_words(line)) if forbids(line, is_whole=False) else ():
-            words = {*re.findall(r"\w+", clause.text.lower())} - {"do", "does"}
-            is_act = any(is_verb([word]) or base_verb(word) for word in words)
-            if clause.kind in ("say", "act") and is_act and forbids(clause.text) and not is_said(clause.text):
-                notes.append(Note(number, f"{shown(clause.text)} is left out: it forbids an action"))
-    return notes[:_MOST_NOTES]
-
-
-def _within(said: Sequence[str]) -> Callable[[str], bool]:
-    """Return a function of a phrase: whether one of the texts contains all of its words."""
-    words_said = [{*re.findall(r"[\w']+", each.lower())} for each in dict.fromkeys(said)]
-
-    def is_said(phrase: str) -> bool:
-        words = {*re.findall(r"[\w']+", phrase.lower())} - {"the", "a", "it", "there", "first", "only"}
-        return any(words <= each for each in words_said)
-
-    return is_said
+def _outside_code(text: str) -> str:
+    """Replace the fenced blocks of a text, or a text without fences, with blank lines."""
+    blocks = _FENCED.sub(lambda block: "\n" * block[0].count("\n"), text)
+    return blocks if blocks != text else ""
 
 
 def _plain_characters(text: str) -> str:

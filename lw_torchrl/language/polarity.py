@@ -13,7 +13,9 @@ from typing import NamedTuple
 from lw_torchrl.language.objects import WORDS
 
 _WORDS = WORDS["negation"]
-_REWRITINGS = [(re.compile(text, re.IGNORECASE), plain) for text, plain in _WORDS["conditions"]]
+_REWRITINGS = [
+    (re.compile(text.replace("<small>", _WORDS["small"]), re.IGNORECASE), plain) for text, plain in _WORDS["conditions"]
+]
 _NOT = frozenset(_WORDS["not"])
 _APOSTROPHE = re.compile("[’‘ʼ´`ʹ′＇]")
 _HUMP = re.compile("(?<=[a-z])(?=[A-Z][a-z])")  # the place of a space in "isNotNear"

@@ -44,11 +44,11 @@ _IS_ANSWER = re.compile(
 _HEADING = re.compile(
     rf"\s*(?:#{{1,6}}\s*|\*\*|__|\[\[ ## |[-=~]{{2,}}\s*)?(?:let me |here(?:'s| is) )?(?:my |the |initial )?{_THOUGHT}"
     r"(?: (?:process|steps?|aloud))?\s*"
-    r"(?:\.{3}|…)?:?(?:\*\*|__| ## \]\]|\s*[-=~]{2,})?:?[ \t]*(?:\n|\Z)",
+    r"(?:\.{3}|…|\([^()\n]{1,60}\))?:?(?:\*\*|__| ## \]\]|\s*[-=~]{2,})?:?[ \t]*(?:\n|\Z)",
     re.IGNORECASE,
 )
 _NEXT_HEADING = re.compile(
-    r"^[ \t]*(?:#{1,6}\s+\S.*|\[\[ ## .* ## \]\]"
+    r"^[ \t]*(?:#{1,6}\s+\S.*|\[\[ ## .* ## \]\]|\w[^\n]{1,60}\n[ \t]*(?:=|-){3,}[ \t]*"
     r"|(?:\*\*|__)[^*_\n]+(?:\*\*|__)[ \t]*:?[ \t]*|-{3,}[ \t]*|(?:\.{3}|…)[ \t]*done.*"
     r"|(?:[\w']+ ){0,5}(?:answer|plan|output|solution|rules|response|result|code)\b[^.:\n]{0,40}:[ \t]*)$",
     re.IGNORECASE | re.MULTILINE,

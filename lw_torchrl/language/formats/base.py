@@ -164,8 +164,16 @@ def is_for_any_task(name: str) -> bool:
 
 
 _CALL = re.compile(r"\b([A-Za-z]\w*)\(([^()]*)\)")
-_DISTANCE = re.compile(r"\(?([\w' ]+?) (?:dist|distance)(?: to)? ([\w' ]+?)\)? *([<>])=? *[\d.]+(?: ?(?:cm|m)\b)?")
+_DISTANCE = re.compile(
+    r"\(?([\w' ]+?) (?:dist|distance)(?: to)? ([\w' ]+?)\)? *([<>])=? *(\d*\.?\d+)(?: ?(mm|cm|m)\b)?"
+)
+_METRES = {"mm": 0.001, "cm": 0.01}
 _QUESTION = re.compile(r"(?:(?:is|are|does|has|do)\s+)?(.+?)\s*\?", re.IGNORECASE)
+
+
+def is_near(distance: float, unit: str = "m") -> bool:
+    """Return whether an object at this distance is about as far as "near" says (4 cm)."""
+    return 0.005 <= distance * _METRES.get(unit, 1.0) <= 0.1
 
 
 def statement(text: str) -> str:
@@ -179,8 +187,12 @@ def statement(text: str) -> str:
         words = " ".join([first, *words_of(call[1].removeprefix("is").removeprefix("Is")), *others])
         return words if call[0] == text else f"({words})"
 
+    def near(match: re.Match[str]) -> str:
+        states_near = is_near(float(match[4]), match[5] or "m")
+        return f"{'not ' * (match[3] == '>')}({match[1]} near {match[2]})" if states_near else match[0]
+
     text = " ".join(_CALL.sub(said, text).replace("&&", "&").replace("||", "|").split())
-    text = _DISTANCE.sub(lambda match: f"{'not ' * (match[3] == '>')}({match[1]} near {match[2]})", text)
+    text = _DISTANCE.sub(near, text)
     text = re.sub(r"[!¬~]\s*(?:not\b\s*)?(?=[\w(])", "not ", re.sub(r"\s*!=\s*(?!true|false)", " is not ", text))
     question = _QUESTION.fullmatch(text)
     return (question[1] if question else text).replace(" & ", " and ").replace(" | ", " or ")

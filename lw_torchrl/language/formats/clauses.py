@@ -14,6 +14,10 @@ from lw_torchrl.language.relations import RELATIONS
 _WORDS = PROGRAM_WORDS["prose"]
 
 
+_ROBOT = re.compile(r"(?:then )?(?:the )?robot (?:should|must|has to|needs to) ", re.IGNORECASE)
+_NO_ACTS = frozenset((*_WORDS["looks"], *PROGRAM_WORDS["prepositions"], "only", "be", "have", "keep", "remain", "stay"))
+
+
 def _any(words: list[str]) -> str:
     return f"(?:{'|'.join(words)})"
 
@@ -264,7 +268,9 @@ def action(text: str, is_certain: bool = False) -> str:
 
     Only if an action is certain, "the gripper is closed" gives "close the gripper"; otherwise it is a state.
     """
+    is_told = False
     while match := _LEAD.match(text) or _JOINT.match(text) or PATTERNS["should"].match(text):
+        is_told |= _ROBOT.match(text) is not None
         text = text[match.end() :]
     if text.lower() in _WORDS["ends"]:
         return text
@@ -291,7 +297,8 @@ def action(text: str, is_certain: bool = False) -> str:
     first = text.partition(" ")[0]
     if first.endswith("s") and not first.endswith("ss") and base_verb(first) and words[1:2] and words[1] in _AFTER_VERB:
         return f"{base_verb(first)} {text.partition(' ')[2]}"
-    return ""
+    is_act = 1 < len(words) <= 40 and first.isalpha() and first.lower() not in _NO_ACTS
+    return text if is_told and is_act and not re.search(r"\b(?:not?|never|without)\b", text) else ""
 
 
 def _is_verb(words: list[str]) -> bool:

@@ -107,6 +107,11 @@ class Module:
             calls = (node for node in ast.walk(function) if isinstance(node, ast.Call))
             called |= {helper for call in calls if (helper := self.helper(call)) and helper != name}
         classes = {node.name: node.body for node in ast.walk(module) if isinstance(node, ast.ClassDef)}
+        self.numbers = {
+            name_of(node.targets[0]): node.value.value
+            for node in ast.walk(module)
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant)
+        }
         # The names of the fields of records, such as ``Rule(when, then)``.
         self.fields = {
             name: [name_of(each.target) for each in body if isinstance(each, ast.AnnAssign)]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from lw_torchrl._util.checks import shown
 from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, as_expression, negate
-from lw_torchrl.language.formats.base import PROGRAM_WORDS, words_of
+from lw_torchrl.language.formats.base import PROGRAM_WORDS, is_near, words_of
 from lw_torchrl.language.formats.code_values import (
     Choice,
     Distance,
@@ -100,7 +100,9 @@ class Expressions:
             case ast.Dict(keys=keys, values=values):
                 return {self.key(key): self.value(each) for key, each in zip(keys, values, strict=True) if key}
             case ast.Name(id=name):
-                unknown = PYTHON["names"].get(name) or " ".join(words_of(name))
+                words = words_of(name)
+                words = words[:-1] if len(words) > 1 and words[-1] in PYTHON["fields"] else words  # "mug_pos"
+                unknown = PYTHON["names"].get(name) or " ".join(words)
                 return self.values[name] if name in self.values else None if is_owner(name) else Name(unknown)
             case ast.Attribute() | ast.Subscript():
                 return self.part(node)
@@ -207,10 +209,11 @@ class Expressions:
         elif isinstance(op, ast.Lt) and number == 1 and isinstance(value, Expression):
             condition, differs = value, True
         elif isinstance(value, Distance):
-            condition, differs = (
-                leaf(joined([value.first, value.relation, value.second])),
-                not isinstance(op, ast.Lt | ast.LtE),
-            )
+            threshold = self.module.numbers.get(name_of(right), number)
+            if isinstance(threshold, int | float) and not is_near(threshold):
+                return None
+            condition = leaf(joined([value.first, value.relation, value.second]))
+            differs = not isinstance(op, ast.Lt | ast.LtE)
             self.note(node, f"the threshold in {shown(ast.unparse(node))} is read as that of {value.relation!r}")
         elif isinstance(value, Choice | str) and isinstance(other, Choice | str):
             is_known = isinstance(value, Choice) or (ast.unparse(right) == "None" and not isinstance(value, Name))

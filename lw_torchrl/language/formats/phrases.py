@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-from lw_torchrl.language.formats.base import PROGRAM_WORDS, command, is_verb, statement, words_of
+from lw_torchrl.language.formats.base import PROGRAM_WORDS, command, is_near, is_verb, statement, words_of
 from lw_torchrl.language.objects import WORDS
 from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.tasks import TASKS
@@ -291,7 +291,8 @@ def comparison_of(row: Mapping[Any, Any]) -> tuple[str, bool] | None:
     for key, text in cells:
         if distance := re.fullmatch(r"dist\w*\(\s*([^,]+?)\s*,\s*([^,]+?)\s*\)", text):
             negated ^= not _WORDS["far"].isdisjoint(signs)
-            said.append(f"{distance[1]} near {distance[2]}")
+            lengths = [each for _, each in cells if re.fullmatch(r"\d*\.?\d+", each) and not is_near(float(each))]
+            said.append(" ".join([f"{distance[1]} near {distance[2]}", *(f"within {each} m" for each in lengths)]))
         elif (truth := truth_of(text)) is not None:
             negated ^= truth == (role_of(key) == "not")
         elif not re.fullmatch(r"[-\d.]+", text) and text not in signs:

@@ -9,7 +9,7 @@ from lw_torchrl.language.formats.base import END, PROGRAM_WORDS, Reading, is_ver
 from lw_torchrl.language.formats.clauses import PATTERNS, RELATION, clauses, is_action, is_state
 from lw_torchrl.language.formats.line_parser import Choice, LineParser, Open, Part, Repeat
 from lw_torchrl.language.formats.markup import WHEN
-from lw_torchrl.language.formats.phrases import role_of
+from lw_torchrl.language.formats.phrases import is_noun, role_of
 from lw_torchrl.language.formats.references import References
 from lw_torchrl.language.programs import Block, Branch, Label, Loop, Node, Sequence, actions_of
 from lw_torchrl.language.tasks import TASKS
@@ -35,7 +35,7 @@ class SentenceReading(Reading):
         if PATTERNS["to_step"].search(text) is None:
             text = PATTERNS["numbered_rule"].sub(r"\1- ", text)  # "1. the gripper is open -> close it"
         lines = _unwrapped(text.splitlines())
-        lines = [PATTERNS["arrow"].sub(lambda arrow: f"{arrow[1] or ':'} ", line) for line in lines]
+        lines = [PATTERNS["arrow"].sub(lambda arrow: f"{arrow[1] or ':'} ", _arrow_rule(line)) for line in lines]
         for line in lines:
             self.content(line[:_LONGEST].strip(" -*•"))  # definitions may follow their use
         for self.line, line in enumerate(lines, 1):
@@ -87,6 +87,9 @@ class SentenceReading(Reading):
         is_title = PATTERNS["heading"].fullmatch(item[3] if item else line) and WHEN.match(following.lstrip(" -*"))
         if not is_title or not is_action(content.rpartition(": ")[2]):
             LineParser(self, content.rstrip("." * self.is_case), is_item, is_head, is_heading).read()
+            last = clauses(content)[-1:] if has_item and item is None and content.endswith(".") else []
+            if any(each.kind in ("act", "say") and not PATTERNS["announces"].search(each.text) for each in last):
+                del self.scopes[self.levels[-1][1] :]  # the list below a whole rule has rules of its own
 
     def content(self, text: str) -> str:
         """Return the content of a line without markup, in usual words; define a name if the line defines one."""
@@ -107,6 +110,20 @@ class SentenceReading(Reading):
             return named[0]
         self.refers.names[name] = meaning.rstrip(".")
         return ""
+
+
+def _arrow_rule(line: str) -> str:
+    """Rewrite "the gripper is tired → open it" as a sentence with "if"; other lines stay as they are."""
+    arrow, item = PATTERNS["arrow"].search(line), PATTERNS["item"].match(line)
+    if arrow is None or arrow[1] or PATTERNS["arrow"].search(line, arrow.end()):
+        return line
+    start = item.start(3) if item else len(line) - len(line.lstrip())
+    state, action = line[start : arrow.start()].strip(), line[arrow.end() :]
+    words = state.split()
+    is_label = ":" in state or (len(words) < 3 and not is_noun(" ".join(words[:1])))
+    if is_label or is_verb(words) or PATTERNS["line_start"].match(state) or not is_verb(action.split()):
+        return line
+    return f"{line[:start]}if {state}: {action}"
 
 
 def usual_words(text: str) -> str:

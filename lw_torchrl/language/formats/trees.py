@@ -60,7 +60,7 @@ from lw_torchrl.language.formats.shapes import (
 )
 from lw_torchrl.language.formats.state_machines import machine
 from lw_torchrl.language.formats.values import parse_value
-from lw_torchrl.language.polarity import forbids, instruction
+from lw_torchrl.language.polarity import command_form, forbids, instruction
 from lw_torchrl.language.programs import (
     Action,
     Block,
@@ -83,6 +83,10 @@ _PROSE = re.compile(r"[.;?] +\w|, *(?:if|unless|otherwise)\b", re.IGNORECASE)
 _SENTENCE = re.compile(r"(?:if|when|unless|otherwise|while)\b.*[,:]", re.IGNORECASE)
 _LEAD = re.compile(r"\s*(?:if|when|whenever|while|once)\s+(?=\w+ )", re.IGNORECASE)
 _CONDITIONAL = re.compile(r"\b(?:if|when|unless|otherwise|while)\b", re.IGNORECASE)
+_PROHIBITION = re.compile(
+    r"(?:the robot |you |it )?(?:(?:must|should|may|can|do) not|(?:must|should|do)n't|cannot|can't|never|avoid)\b",
+    re.IGNORECASE,
+)
 _AND_OR = re.compile(r"\s*(?:\band\b|\bor\b|\bnot\b|[()&|!]+)\s*", re.IGNORECASE)
 
 
@@ -328,7 +332,11 @@ class Tree:
             text = plain(value.split(".")[-1]) if isinstance(value, str) else ""
             texts = value if isinstance(value, list) else [value]
             is_rule = role == "else" or _CONDITIONAL.match(key) is not None or is_statement(key)
-            is_forbidden = all(isinstance(each, str) and is_command(each) for each in texts)
+            are_all = bool(texts) and all(isinstance(each, str) and _PROHIBITION.match(each) for each in texts)
+            if are_all and role != "act" and not is_rule:
+                self.reading.note(self.line(key), f"{shown(value)} is left out: it forbids an action")
+                continue  # {"constraints": ["do not lift the mug"]}
+            is_forbidden = all(isinstance(each, str) and _is_act(each) for each in texts)
             is_forbidden |= forbids(plain(key)) and any(map(has_action, texts))  # {"do_not": [{"when": ...}]}
             if is_forbidden and not is_rule and not instruction(plain(key)).text:
                 self.reading.note(self.line(key), f"{shown(value)} is left out: {shown(key)} forbids it")
@@ -457,7 +465,7 @@ class Tree:
         """Convert a field to a program node according to its key."""
         if plain(key) == "nand":
             return self.object({"not": {"all": value}}, hint)
-        if role in ("", "test") and is_statement(key):
+        if role in ("", "test", "loop") and is_statement(key):
             if (truth := truth_of(value)) is not None:
                 return Check(self.said(key) if truth else negate(self.said(key)))
             if str(value).lower() in ("*", "-", "any", ""):  # of a decision table
@@ -478,6 +486,11 @@ class Tree:
         if join and isinstance(value, list) and role != "act":
             return self.listed(value, hint, join)
         return self.node(value, "act" if role == "act" else hint)
+
+
+def _is_act(text: str) -> bool:
+    """Return whether a text is a command, or names an action: "lifting the puck"."""
+    return is_command(text) or command_form(text.lower().partition(" ")[0]) is not None
 
 
 def _sections(text: str) -> list[tuple[int, str | list[str]]]:
