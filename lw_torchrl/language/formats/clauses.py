@@ -12,10 +12,8 @@ from lw_torchrl.language.objects import WORDS
 from lw_torchrl.language.relations import RELATIONS
 
 _WORDS = PROGRAM_WORDS["prose"]
-
-
 _ROBOT = re.compile(r"(?:then )?(?:the )?robot (?:should|must|has to|needs to) ", re.IGNORECASE)
-_NO_ACTS = frozenset((*_WORDS["looks"], *PROGRAM_WORDS["prepositions"], "only", "be", "have", "keep", "remain", "stay"))
+_NO_ACTS = frozenset((*_WORDS["looks"], *_WORDS["no_verbs"], *PROGRAM_WORDS["prepositions"]))
 
 
 def _any(words: list[str]) -> str:
