@@ -112,7 +112,8 @@ class Layout:
         return slice(0, 0) if self.gripper is None else slice(self.gripper, self.gripper + 1)
 
     def displaced(self, user: str) -> slice:
-        """Return the slice of the hand's displacement in an action, or raise a ValueError that names the ``user``."""
+        """Return the slice of an action with the hand's displacement; without one, raise a ValueError that names
+        ``user``."""
         if self.displacement is None:
             needed = "actions must have a displacement of the hand"
             raise ValueError(f"{user}: {needed}, got layout {self.name!r}")

@@ -68,7 +68,7 @@ def _read_coordinate(value: Any) -> Coordinate:
 
 
 def _read_position(value: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
-    """Parse a position of tasks.toml, such as "obs[4:7]" or [0.1, "obs[37]", 0.0]."""
+    """Parse a position from tasks.toml, such as "obs[4:7]" or [0.1, "obs[37]", 0.0]."""
     if isinstance(value, str) and (match := _SLICE.fullmatch(value)):
         start, stop = map(int, match.groups())
         if stop - start == 3:

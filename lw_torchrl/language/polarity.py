@@ -159,9 +159,9 @@ def command_form(word: str) -> str | None:
 
 
 def _is_only_mentioned(text: str) -> bool:
-    """Return whether a text mentions an action without a command to do it: "postpone closing the gripper".
+    """Return whether a text mentions an action without commanding it: "postpone closing the gripper".
 
-    Words before the action must be known to affirm it, such as "start by"; any other words make it uncertain.
+    Known words such as "start by" may precede a commanded action; after any other words, it counts as only mentioned.
     """
     rest = _AFFIRMS.sub("", text.lower(), count=1)
     clause = rest[: match.start()] if (match := _END_OF_CLAUSE.search(rest, 1)) else rest

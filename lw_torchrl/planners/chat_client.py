@@ -83,7 +83,7 @@ class ChatClient:
         for name in (_KEY, "OPENAI_ORG_ID", "OPENAI_PROJECT_ID"):  # these become headers of each request
             value = os.environ.get(name, "").strip()
             if not (value.isascii() and value.isprintable()):
-                raise PlannerError(f"the key in {name} has invalid characters; set {name} again", fatal=True)
+                raise PlannerError(f"the value of {name} has invalid characters; set {name} again", fatal=True)
         self._fallbacks = frozenset({"max_completion_tokens"} if self.address == OPENAI else ())
         options: Any = {"timeout": openai.Timeout(timeout, connect=min(timeout, 10.0))}
         self._is_local = _is_local(self.address)

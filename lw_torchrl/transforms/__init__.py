@@ -1,4 +1,4 @@
-"""TorchRL transforms that write answers to conditions, pictures or task descriptions, or augment sampled rows."""
+"""TorchRL transforms that write truth values of conditions, pictures or task descriptions, or augment sampled rows."""
 
 import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.transforms.augmentation import JitterTarget, SwapUnmentioned

@@ -200,7 +200,7 @@ def test_a_missing_or_broken_key(tmp_path, monkeypatch):
         lw.OpenAIPlanner("m", cache=tmp_path).plans("push")
     for key in ("sk-\u20ac9876543", "sk-98765\n43210"):
         monkeypatch.setenv("OPENAI_API_KEY", key)
-        with pytest.raises(PlannerError, match="the key in OPENAI_API_KEY has invalid characters") as caught:
+        with pytest.raises(PlannerError, match="the value of OPENAI_API_KEY has invalid characters") as caught:
             lw.OpenAIPlanner("m", cache=tmp_path).plans("push")
         assert "9876" not in str(caught.value)
 

@@ -53,7 +53,7 @@ TASK_NAMES = (
     "task", "task_name", "language_instruction", "instruction", "task_description", "language", "lang", "env_name",
     "env_id", "task_id", "task_index",
 )  # fmt: skip
-"""The names that files use for an episode's task: attributes, columns, and keys of JSON."""
+"""The names under which files store an episode's task: HDF5 attributes, columns and JSON keys."""
 _AFTER = ("reward_sparse", "reward_dense", "success", "done", "terminated", "truncated")  # results of the last step
 HDF5, PARQUET = (".hdf5", ".h5", ".hdf"), (".parquet", ".pq")
 

@@ -143,7 +143,7 @@ def _is_cut(before: str, rest: str) -> bool:
 
 
 def _clause(text: str, stop: str) -> Iterator[Clause]:
-    """Yield the clauses of a text without cuts: the connectives, and the rest."""
+    """Yield the clauses of an uncut part of a line: leading words such as "otherwise" or "yes", then the rest."""
     joint = ""
     while text:
         if match := _JOINT.match(text):

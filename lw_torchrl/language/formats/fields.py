@@ -1,4 +1,4 @@
-"""What the fields of an object in JSON or YAML are: goals, tests, programs, states of a machine, transitions."""
+"""Classify the fields of an object in JSON or YAML: goals, tests, programs, states of a machine, transitions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A parser of the clauses of a line, which builds choices, loops and actions from them."""
+"""A parser that builds choices, loops and actions from the clauses of a line."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ class LineParser:
         return tests[0] if not tests[1:] else (any_of if word == "or" else all_of)(tests)
 
     def conditional(self, clause: Clause) -> None:
-        """Add a condition before or after actions."""
+        """Add a condition that guards the actions before or after it."""
         acts, stop = self.acts, clause.stop
         after = next((each for each in self.clauses[self.at :] if each.kind != "state"), Clause("say", ""))
         is_led = stop == "" and len(self.scopes) > self.start and after is self.next
@@ -245,7 +245,7 @@ class LineParser:
         return None
 
     def refer(self, clause: Clause) -> None:
-        """Add what "otherwise", "if so" or "in that case" refers to."""
+        """Continue in the branch that "otherwise", "if so" or "in that case" refers to, or open that branch."""
         kind, is_same = clause.kind, clause.kind in ("same", "yes")
         answer = "yes" if is_same else "no" if kind in ("different", "no", "not") else ""
         question = self.open(answer) if answer else None
@@ -391,7 +391,7 @@ class LineParser:
             self.reading.note(self.reading.line, f"{shown(text)} is left out: its condition is not understood")
 
     def repeat(self, repeat: re.Match[str], stop: str) -> None:
-        """Add a loop over the steps above, or a guard of the items below."""
+        """Add a loop over the preceding steps, or let the loop's condition guard the items that follow."""
         test = self.refers.condition(repeat[3].rstrip(":"))
         test = negate(test) if repeat[2].lower() == "until" else test
         if self.is_head or stop == ":":

@@ -154,7 +154,7 @@ def _unwrapped(key: Any, value: Any) -> Any:
 
 
 def _from_text(text: str, usual: Any, depth: int) -> Any:
-    """Return the JSON or the rules that a text contains."""
+    """Return the JSON value, rules, skill or labelled text that a text consists of; otherwise the text itself."""
     inner = text.strip()
     if skill := _SKILL.fullmatch(inner):
         return skill[1]

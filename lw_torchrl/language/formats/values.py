@@ -124,7 +124,7 @@ def _element(element: ElementTree.Element, depth: int) -> dict[str, Any]:
 
 
 def _yaml(text: str) -> Any:
-    """Parse YAML without its types; None if the text is not YAML. Several documents are a list."""
+    """Parse YAML, with all scalars as strings and several documents as a list; return None if it is not YAML."""
     if len(documents := _DOCUMENT.split(text)) > 1:
         values = [value for value in map(_yaml, documents) if isinstance(value, dict | list)]
         return values if len(values) > 1 else values[0] if values else None

@@ -24,7 +24,7 @@ from lw_torchrl.suites.metaworld.compiled_rows import ROW
 from lw_torchrl.suites.metaworld.environments import WARNED_ALREADY, Places
 
 if sys.platform != "linux":
-    raise ImportError("the compiled simulation was tested on Linux only")
+    raise ImportError("the compiled simulation is supported only on Linux")
 
 # The bindings' library depends on MuJoCo's, so a look-up in it finds the copy of MuJoCo that the bindings use.
 _mujoco = ctypes.CDLL(mujoco._functions.__file__)
