@@ -21,6 +21,8 @@ _CLAUSES = re.compile(
     re.IGNORECASE,
 )
 _RULE = re.compile(r"\b(?:when|whenever|if|once|unless|as soon as|should the|every time|in case)\b", re.IGNORECASE)
+_HEAD = r"(?!.*\b(?:condition|when|if|state|action|skill|do|then|step)s?\b *\|)"
+_ROW = re.compile(rf"\s*\|{_HEAD}(?=.*\w).*\|\s*$|\s*<tr>.*<td>", re.IGNORECASE)
 _SENTENCE = re.compile(r"(?<=[.!?;])\s+")
 _COMMON = {"the", "a", "an", "it", "there", "first", "only", "is", "are", "and", "to", "of", "then", "robot", "should"}
 _MOST = 50  # maximum number of notes
@@ -60,7 +62,7 @@ def unread(
         near = [words for place, words in words_of_skills if abs(place - number) < 4 or not is_prose]
         sentences = _SENTENCE.split(line)
         for sentence in sentences if len(sentences) > 1 or number not in noted else ():
-            if _RULE.search(sentence) and not _is_used(sentence, near, is_noted):
+            if (_RULE.search(sentence) or _ROW.match(sentence)) and not _is_used(sentence, near, is_noted):
                 found.append(Note(number, f"the rule is not read: {shown(sentence.strip())}"))
         item = PATTERNS["item"].match(line)
         if is_prose and len(found) == before and item and number not in known and _is_remark(item[3]):

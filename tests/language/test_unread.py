@@ -155,3 +155,31 @@ def test_two_adverbs_share_a_relation(joint):
         f"the robot's gripper is not horizontally aligned with the mug {other} "
         "the robot's gripper is not vertically aligned with the mug"
     )
+
+
+def test_statements_without_a_function_are_code():
+    text = "```python\nif not gripper_near_mug:\n    move_gripper_to_mug()\nelse:\n    push_mug()\n```"
+    assert [condition for condition, _ in steps(text)] == [MOVE[0], PUSH[0]]
+
+
+@pytest.mark.parametrize("test", ["is_far(gripper, mug)", "far(gripper, mug)", "not near(gripper, mug)"])
+def test_far_is_not_near(test):
+    assert steps(f"def coffee_push():\n    if {test}:\n        move_to(mug)\n")[0][0] == MOVE[0]
+
+
+def test_never_if_forbids_its_action():
+    rules = "- when: the gripper is near the mug\n  do: push the mug\n"
+    rules += "- never_if: the mug is near the target location\n  do: lift it\n"
+    assert [skill for _, skill in steps(rules)] == ["push the mug"]
+    assert "'never_if' forbids it" in notes(rules)
+
+
+def test_cases_of_a_switch_are_conditions():
+    text = "switch:\n  case gripper is not near mug: move the gripper to the mug\n  case gripper is near mug: push it\n"
+    assert [condition for condition, _ in steps(text)] == [MOVE[0], PUSH[0]]
+
+
+def test_rows_of_a_table_that_no_step_has_are_noted():
+    table = "| Condition | Skill |\n|---|---|\n| the gripper is near the mug | push the mug |\n| the radio plays | dance |\n"
+    assert [skill for _, skill in steps(table)] == ["push the mug"]
+    assert "radio" in notes(table)

@@ -243,6 +243,7 @@ class Expressions:
         if words and (is_check(node) or is_sentence):
             return joined(words)
         receiver, name = self.receiver(node.func), words_of(name_of(node.func))
+        name += ["from"] * (name[-1] == "far")
         if words and name[-1] not in _RELATIONS and not is_noun(str(receiver)) and is_noun(str(words[0])):
             receiver = ""  # "vision.is_closed(gripper)"
         if len(words) > 1 or (words and not receiver and name[-1:] != ["holding"] and name[-1] not in _RELATIONS):

@@ -332,7 +332,12 @@ class Tree:
             text = plain(value.split(".")[-1]) if isinstance(value, str) else ""
             texts = value if isinstance(value, list) else [value]
             is_rule = role == "else" or _CONDITIONAL.match(key) is not None or is_statement(key)
-            are_all = bool(texts) and all(isinstance(each, str) and _PROHIBITION.match(each) for each in texts)
+            if plain(key).startswith("never "):
+                self.reading.note(self.line(key), f"{shown(row)} is left out: {shown(key)} forbids it")
+                return None  # {"never_if": ..., "do": ...}
+            is_avoided = re.fullmatch(r"(?:(?:actions|things|what) to )?avoid", plain(key)) is not None
+            are_all = is_avoided or bool(texts)
+            are_all &= all(isinstance(each, str) and (is_avoided or _PROHIBITION.match(each)) for each in texts)
             if are_all and role != "act" and not is_rule:
                 self.reading.note(self.line(key), f"{shown(value)} is left out: it forbids an action")
                 continue  # {"constraints": ["do not lift the mug"]}

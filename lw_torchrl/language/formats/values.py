@@ -17,7 +17,10 @@ _YAML = re.compile(r"^[ \t]*(?:(?:- )?[\w -]{1,40}:(?:\s|$)|- [\[{])", re.MULTIL
 _BEGINNING = re.compile(r"\s*(?:#|- |\w[^:.\n]*\?:)")  # other beginnings of YAML
 _TAGS = ("selector", "sequence", "test", "act")
 _MOST_DEPTH = 1_000
-_CODE = re.compile(r"^[ \t]*(?:async )?(?:def|class) \w", re.MULTILINE)
+_CODE = re.compile(  # a definition, or a call below the head of a block
+    r"^[ \t]*(?:(?:async )?(?:def|class) \w|(?:if|elif|while|for) [^\n]*:[ \t]*(?:#[^\n]*)?\n[ \t]+[\w.]+\()",
+    re.MULTILINE,
+)
 _TAG = re.compile(r"^[ \t]*<[A-Za-z][^<>]*>", re.MULTILINE)
 _COMMENT = re.compile(r"^[ \t]*#(?: |$).*$", re.MULTILINE)
 _DOCUMENT = re.compile(r"^(?:---|\.\.\.)[ \t]*$", re.MULTILINE)
@@ -146,6 +149,7 @@ def _yaml(text: str) -> Any:
         return found[0] if role_of(tag) in _TAGS else f'{found[1]}"{found[2]}"'  # "!" negates, or marks an action
 
     text = re.sub(r"((?:: |- ) *)(!\S[^\n]*)", quoted, text)
+    text = re.sub(r"^([ \t]*(?:- )?)case (?=[^:\n]+:)", r"\1when ", text, flags=re.MULTILINE)
     paragraphs = re.split(r"\n\s*\n", text)
     while paragraphs and not (_YAML.match(paragraphs[0].lstrip()) or _BEGINNING.match(paragraphs[0])):
         paragraphs.pop(0)  # sentences around the YAML
