@@ -24,6 +24,7 @@ _RULE = re.compile(r"\b(?:when|whenever|if|once|unless|as soon as|should the|eve
 _HEAD = r"(?!.*\b(?:condition|when|if|state|action|skill|do|then|step)s?\b *\|)"
 _ROW = re.compile(rf"\s*\|{_HEAD}(?=.*\w).*\|\s*$|\s*<tr>.*<td>", re.IGNORECASE)
 _SENTENCE = re.compile(r"(?<=[.!?;])\s+")
+_WORD = re.compile(r"[^\W\d_]{2}")
 _COMMON = {"the", "a", "an", "it", "there", "first", "only", "is", "are", "and", "to", "of", "then", "robot", "should"}
 _MOST = 50  # maximum number of notes
 
@@ -54,6 +55,8 @@ def unread(
     found = list[Note]()
     for number, line in enumerate(text.splitlines(), 1):
         line, before = line[:8_000], len(found)
+        if not _WORD.search(line):
+            continue
         found += (Note(number, reason) for reason in _prohibitions(line, is_noted))
         if is_prose and known:
             found += (Note(number, reason) for reason in _actions(line, is_said))
