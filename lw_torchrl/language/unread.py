@@ -62,10 +62,12 @@ def unread(
             found += (Note(number, reason) for reason in _actions(line, is_said))
         if len(found) > before or not known:
             continue
-        near = [words for place, words in words_of_skills if abs(place - number) < 4 or not is_prose]
         sentences = _SENTENCE.split(line)
         for sentence in sentences if len(sentences) > 1 or number not in noted else ():
-            if (_RULE.search(sentence) or _ROW.match(sentence)) and not _is_used(sentence, near, is_noted):
+            if not (_RULE.search(sentence) or _ROW.match(sentence)):
+                continue
+            near = [words for place, words in words_of_skills if abs(place - number) < 4 or not is_prose]
+            if not _is_used(sentence, near, is_noted):
                 found.append(Note(number, f"the rule is not read: {shown(sentence.strip())}"))
         item = PATTERNS["item"].match(line)
         if is_prose and len(found) == before and item and number not in known and _is_remark(item[3]):
