@@ -20,9 +20,7 @@ _HANDS = frozenset(" ".join((GRIPPER, *WORDS["canonical"]["hands"], *_NOUNS["han
 _PLACES = frozenset(" ".join((*PREDICATES, *WORDS["canonical"]["place"], *_NOUNS["places"])).split()) - {"the", "table"}
 _GOALS = ("target", "location", "goal", "destination")
 _TOUCHES = re.compile(rf"\b(?:{'|'.join(WORDS['contact'])})\b.*?\btable\b")
-_LENGTH = re.compile(
-    r"\d(?:[\d.]*)? ?(?:mm|cm|m|(?:milli|centi)?met(?:re|er)s?|inch(?:es)?|feet|foot|ft)\b", re.IGNORECASE
-)
+_LENGTH = re.compile(r"\d[\d.]* ?(?:mm|cm|m|(?:milli|centi)?met(?:re|er)s?|inch(?:es)?|feet|foot|ft)\b", re.IGNORECASE)
 _MOST_WORDS = 40  # maximum number of words of a part of a condition
 
 

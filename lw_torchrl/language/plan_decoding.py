@@ -43,7 +43,7 @@ from lw_torchrl.language.skills import Skills, canonical_skill
 from lw_torchrl.language.step_parser import skill_effect
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
 from lw_torchrl.language.thoughts import without_thoughts
-from lw_torchrl.language.unread import Said, unread
+from lw_torchrl.language.unread import unread
 
 
 @dataclass(frozen=True)
@@ -161,8 +161,7 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
     is_prose = isinstance(reading, ProseReading | SentenceReading)
     if read is None or is_prose or not clauses:
         read_text = text if is_prose or not clauses else _outside_code(text)
-        said, reasons = [Said(each.line, each.skill) for each in clauses], [each.reason for each in clauses]
-        notes += unread(read_text, said, reasons, notes, is_prose and read is None)
+        notes += unread(read_text, clauses, notes, is_prose and read is None)
 
     def plan(skills: Sequence[str | None]) -> ConditionalPlan | None:
         kept = tuple(

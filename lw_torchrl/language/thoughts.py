@@ -48,7 +48,7 @@ _HEADING = re.compile(
     re.IGNORECASE,
 )
 _NEXT_HEADING = re.compile(
-    r"^[ \t]*(?:#{1,6}\s+\S.*|\[\[ ## .* ## \]\]|\w[^\n]{1,60}\n[ \t]*(?:=|-){3,}[ \t]*"
+    r"^[ \t]*(?:#{1,6}\s+\S.*|\[\[ ## .* ## \]\]|\w[^\n]{1,60}\n[ \t]*[=-]{3,}[ \t]*"
     r"|(?:\*\*|__)[^*_\n]+(?:\*\*|__)[ \t]*:?[ \t]*|-{3,}[ \t]*|(?:\.{3}|…)[ \t]*done.*"
     r"|(?:[\w']+ ){0,5}(?:answer|plan|output|solution|rules|response|result|code)\b[^.:\n]{0,40}:[ \t]*)$",
     re.IGNORECASE | re.MULTILINE,

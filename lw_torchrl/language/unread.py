@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
 
 from lw_torchrl._util.checks import shown
-from lw_torchrl.language.formats.base import Note, is_verb
+from lw_torchrl.language.formats.base import Clause, Note, is_verb
 from lw_torchrl.language.formats.clauses import PATTERNS, base_verb
 from lw_torchrl.language.formats.clauses import clauses as cut
 from lw_torchrl.language.formats.sentences import usual_words
@@ -29,29 +28,19 @@ _COMMON = {"the", "a", "an", "it", "there", "first", "only", "is", "are", "and",
 _MOST = 50  # maximum number of notes
 
 
-class Said(NamedTuple):
-    """A text of a step, and the number of its line."""
-
-    line: int
-    text: str
-
-
-def unread(
-    text: str, skills: Sequence[Said], reasons: Sequence[str], notes: Sequence[Note], is_prose: bool
-) -> list[Note]:
+def unread(text: str, clauses: Sequence[Clause], notes: Sequence[Note], is_prose: bool) -> list[Note]:
     """Return a note for each prohibition, rule, action and item of a list that is in neither a step nor another note.
 
     Args:
-        skills: the skills of the steps.
-        reasons: the reasons of the steps.
+        clauses: the clauses of the steps.
         notes: the other notes.
         is_prose: whether the text is prose; of other texts, only prohibitions and rules are noted.
     """
-    said = [*(skill.text for skill in skills), *(note.text for note in notes)]
-    is_noted, is_said = _within(said), _within([*said, *reasons])
+    said = [*(clause.skill for clause in clauses), *(note.text for note in notes)]
+    is_noted, is_said = _within(said), _within([*said, *(clause.reason for clause in clauses)])
     noted = {note.line for note in notes}
-    known = {skill.line for skill in skills} | noted
-    words_of_skills = [(skill.line, _words(skill.text)) for skill in skills if skill.text]
+    known = {clause.line for clause in clauses} | noted
+    words_of_skills = [(clause.line, _words(clause.skill)) for clause in clauses if clause.skill]
     found = list[Note]()
     for number, line in enumerate(text.splitlines(), 1):
         line, before = line[:8_000], len(found)

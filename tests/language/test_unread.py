@@ -3,8 +3,8 @@
 import pytest
 
 import lw_torchrl as lw
-from lw_torchrl.language.formats.base import Note
-from lw_torchrl.language.unread import Said, unread
+from lw_torchrl.language.formats.base import Clause, Note
+from lw_torchrl.language.unread import unread
 
 RULES = (
     "- When the gripper is not near the mug, move the gripper to the mug.\n"
@@ -49,8 +49,8 @@ def test_a_rule_below_code_is_noted():
 
 
 def test_notes_of_a_text():
-    said = [Said(1, "push the mug")]
-    assert unread("If the gripper is open, push the mug.\nIf it rains, sing.", said, [], [], True) == [
+    clauses = [Clause(1, "the gripper is open", "push the mug")]
+    assert unread("If the gripper is open, push the mug.\nIf it rains, sing.", clauses, [], True) == [
         Note(2, "the rule is not read: 'If it rains, sing.'")
     ]
 

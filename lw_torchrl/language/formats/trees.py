@@ -335,10 +335,7 @@ class Tree:
             if plain(key).startswith("never "):
                 self.reading.note(self.line(key), f"{shown(row)} is left out: {shown(key)} forbids it")
                 return None  # {"never_if": ..., "do": ...}
-            is_avoided = re.fullmatch(r"(?:(?:actions|things|what) to )?avoid", plain(key)) is not None
-            are_all = is_avoided or bool(texts)
-            are_all &= all(isinstance(each, str) and (is_avoided or _PROHIBITION.match(each)) for each in texts)
-            if are_all and role != "act" and not is_rule:
+            if role != "act" and not is_rule and _forbids_only(key, texts):
                 self.reading.note(self.line(key), f"{shown(value)} is left out: it forbids an action")
                 continue  # {"constraints": ["do not lift the mug"]}
             is_forbidden = all(isinstance(each, str) and _is_act(each) for each in texts)
@@ -491,6 +488,13 @@ class Tree:
         if join and isinstance(value, list) and role != "act":
             return self.listed(value, hint, join)
         return self.node(value, "act" if role == "act" else hint)
+
+
+def _forbids_only(key: str, values: list[Any]) -> bool:
+    """Return whether a field has only prohibitions, or only texts below a key such as "avoid"."""
+    if re.fullmatch(r"(?:(?:actions|things|what) to )?avoid", plain(key)):
+        return all(isinstance(each, str) for each in values)
+    return bool(values) and all(isinstance(each, str) and _PROHIBITION.match(each) for each in values)
 
 
 def _is_act(text: str) -> bool:
