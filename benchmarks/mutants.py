@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -130,8 +131,8 @@ def _with(mutant: Mutant, path: Path, number: int) -> list[str]:
     return lines
 
 
-def is_found(root: Path, mutant: Mutant, timeout: int) -> bool:
-    """Return whether the tests of the mutant's folder, or those of the whole package, fail in a changed checkout."""
+def finding_test(root: Path, mutant: Mutant, timeout: int) -> str:
+    """Return the first test of the mutant's folder, or of the modules that all use, that fails, or an empty string."""
     path, number = mutants_of(root)[mutant]
     text = path.read_text("utf-8")
     path.write_text("".join(_with(mutant, path, number)), "utf-8")
@@ -143,14 +144,15 @@ def is_found(root: Path, mutant: Mutant, timeout: int) -> bool:
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider", *tests]
     environment = os.environ | {"PYTHONPATH": str(root.resolve()), "OMP_NUM_THREADS": "1"}
     try:
-        done = subprocess.run(command, cwd=root, env=environment, capture_output=True, timeout=timeout)
+        done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=timeout)
     except subprocess.TimeoutExpired:
-        return True
+        return "time limit"
     finally:
         path.write_text(text, "utf-8")
         for cache in Path(root, PACKAGE).rglob("__pycache__"):
             shutil.rmtree(cache, ignore_errors=True)
-    return done.returncode != 0
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    return "" if done.returncode == 0 else failed[1] if failed else f"exit status {done.returncode}"
 
 
 def main(args: Arguments) -> int:
@@ -159,16 +161,12 @@ def main(args: Arguments) -> int:
     checkouts = {"before": args.before, "after": args.after}
     for mutant in chosen:
         with ThreadPoolExecutor() as pool:
-            runs = {name: pool.submit(is_found, root, mutant, args.timeout) for name, root in checkouts.items()}
+            runs = {name: pool.submit(finding_test, root, mutant, args.timeout) for name, root in checkouts.items()}
         found = {name: run.result() for name, run in runs.items()}
-        different += found["before"] != found["after"]
-        state = (
-            "found by both" if all(found.values()) else "found by neither" if not any(found.values()) else str(found)
-        )
-        print(
-            f"{mutant.folder or '_util':12} {state:18} {mutant.function}: {mutant.line}  ->  {mutant.changed}",
-            flush=True,
-        )
+        different += bool(found["before"]) != bool(found["after"])
+        print(f"{mutant.folder or '_util'}: {mutant.function}: {mutant.line}  ->  {mutant.changed}")
+        for name, test in found.items():
+            print(f"    {name:6} {'found by ' + test if test else 'not found'}", flush=True)
         rows.append({**mutant._asdict(), **found})
         write_json(args.out, {"seed": args.seed, "mutants": rows})
     print(f"{len(chosen)} mutants, found by only one of the two: {different}")
