@@ -242,7 +242,7 @@ class Expressions:
         is_sentence = len(words) > 2 or any(isinstance(each, str) and len(each.split()) > 3 for each in words)
         if words and (is_check(node) or is_sentence):
             return joined(words)
-        receiver, name = self.receiver(node.func), words_of(name_of(node.func))
+        receiver, name = self.receiver(node.func), words_of(name_of(node.func)) or [""]
         name += ["from"] * (name[-1] == "far")
         if words and name[-1] not in _RELATIONS and not is_noun(str(receiver)) and is_noun(str(words[0])):
             receiver = ""  # "vision.is_closed(gripper)"
