@@ -144,11 +144,7 @@ def test_tags_in_json_are_ordinary_words():
     for tag in ("</think>", "<think>", "[THINK] x [/THINK]"):
         row = json.loads(write_structured(plan, PLAN_FORMATS["chain_py"].style))
         row["steps"][2]["because"] = f"Because. {tag}"
-        for text in (
-            json.dumps(row),
-            f"<think>Or {{}}?</think>{json.dumps(row)}",
-            f"```json\n{json.dumps(row)}\n```",
-        ):
+        for text in (json.dumps(row), f"<think>Or {{}}?</think>{json.dumps(row)}", f"```json\n{json.dumps(row)}\n```"):
             found = decode_as(text, read_structured, StepMapper(lw.TASKS["push"], None))
             assert found.plan == plan
 

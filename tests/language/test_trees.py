@@ -44,9 +44,7 @@ def test_every_shape_of_a_policy_is_the_same_plan(name):
 
 FACTS = {"a": "gripper near puck", "b": "gripper open", "c": "puck above wall", "d": "puck near target location"}
 policies = st.recursive(
-    st.integers(0, 99),
-    lambda inner: st.tuples(st.sampled_from("abcd"), st.booleans(), inner, inner),
-    max_leaves=6,
+    st.integers(0, 99), lambda inner: st.tuples(st.sampled_from("abcd"), st.booleans(), inner, inner), max_leaves=6
 )
 KEYS = [("if", "then", "else"), ("query", "on_true", "on_false"), ("situation", "response", "otherwise"),
         ("when", "run", "default"), ("Is it so", "yes", "no")]  # fmt: skip

@@ -19,34 +19,10 @@ from lw_torchrl.language.formats.base import (
     task_name,
     words_of,
 )
-from lw_torchrl.language.formats.code_expressions import (
-    PYTHON,
-    Expressions,
-    is_carrier,
-    is_check,
-    is_owner,
-    name_of,
-)
-from lw_torchrl.language.formats.code_values import (
-    Choice,
-    Name,
-    Text,
-    Value,
-    action,
-    chosen,
-    joined,
-)
+from lw_torchrl.language.formats.code_expressions import PYTHON, Expressions, is_carrier, is_check, is_owner, name_of
+from lw_torchrl.language.formats.code_values import Choice, Name, Text, Value, action, chosen, joined
 from lw_torchrl.language.formats.python import state_to_reach
-from lw_torchrl.language.programs import (
-    Action,
-    Block,
-    Branch,
-    Jump,
-    Label,
-    Loop,
-    Node,
-    actions_of,
-)
+from lw_torchrl.language.programs import Action, Block, Branch, Jump, Label, Loop, Node, actions_of
 
 _COMMENTS = PROGRAM_WORDS["keys"]["comment"]
 _MOST_REPAIRS = 8  # maximum number of syntax errors to repair by cutting off code

@@ -196,10 +196,8 @@ class Expressions:
 
     def comparison(self, node: ast.Compare, left: ast.expr, op: ast.cmpop, right: ast.expr) -> Expression | None:
         """Convert a comparison with a truth value, a threshold, or the text of a variable to a condition."""
-        differs, is_equality = (
-            isinstance(op, ast.NotEq | ast.IsNot),
-            isinstance(op, ast.Eq | ast.Is | ast.NotEq | ast.IsNot),
-        )
+        differs = isinstance(op, ast.NotEq | ast.IsNot)
+        is_equality = differs or isinstance(op, ast.Eq | ast.Is)
         value, other = self.value(left), self.value(right)
         condition: Expression | None = None
         number = right.value if isinstance(right, ast.Constant) else None

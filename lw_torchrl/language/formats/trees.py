@@ -18,18 +18,6 @@ from lw_torchrl._util.checks import shown
 from lw_torchrl.language.connectives import parse_words
 from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, as_expression, negate
 from lw_torchrl.language.formats.base import PROGRAM_WORDS, Reading, code_blocks, command, in_turn, statement, words_of
-from lw_torchrl.language.formats.fields import (
-    is_always,
-    is_answer,
-    is_facts,
-    is_goal,
-    is_machine,
-    is_program,
-    is_reserved,
-    is_skipped,
-    is_test,
-    transitions_of,
-)
 from lw_torchrl.language.formats.phrases import (
     ROLES,
     STRUCTURE,
@@ -52,13 +40,21 @@ from lw_torchrl.language.formats.shapes import (
     MOST_VALUES,
     RULE,
     has_action,
+    is_always,
+    is_answer,
+    is_facts,
+    is_goal,
+    is_program,
+    is_reserved,
+    is_skipped,
+    is_test,
     names_of,
     states,
     texts_in,
     usual_shape,
     values_in,
 )
-from lw_torchrl.language.formats.state_machines import machine
+from lw_torchrl.language.formats.state_machines import is_machine, machine, transitions_of
 from lw_torchrl.language.formats.values import parse_value
 from lw_torchrl.language.polarity import command_form, forbids, instruction
 from lw_torchrl.language.programs import (
