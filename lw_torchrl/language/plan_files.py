@@ -143,15 +143,13 @@ def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks
     if skills != "own":
         raise ValueError(f"skills={skills!r} only applies to source 'MT10' or 'MT50', got source {str(source)!r}")
     path = Path(source)
-    if not path.exists():
-        raise FileNotFoundError(f"no plan file or folder {str(path)!r}; 'MT10' and 'MT50' load the shipped plans")
-    if path.suffix == ".json":
+    if path.suffix == ".json" and path.exists():
         return _read_pairs(path, tasks)
     # Skip the temporary files of an interrupted save_plans, whose names start with a dot.
     paths = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
     if not paths:
-        hint = "use lw.decode_plan for a language model's answer, and lw.save_plans to write .plan files"
-        raise FileNotFoundError(f"the folder {str(path)!r} contains no .plan files; {hint}")
+        hint = "'MT10' and 'MT50' load the shipped plans, and lw.decode_plan reads a language model's answer"
+        raise FileNotFoundError(f"no plan file, or folder with .plan files, {str(path)!r}; {hint}")
     return _read_all(list[Traversable](paths), tasks)
 
 

@@ -13,6 +13,7 @@ from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any
 from lw_torchrl.language.formats.base import (
     PROGRAM_WORDS,
     Reading,
+    Section,
     code_blocks,
     is_for_any_task,
     is_verb,
@@ -137,7 +138,7 @@ class Module:
         """Add a section with the tree of the given statements, without calls to the functions in ``roots``."""
         tree = _Scope(self, dict(self.constants.values), roots).block(body)
         if next(actions_of(tree), None) is not None:
-            self.reading.add_tree(task, line, tree)
+            self.reading.sections.append(Section(task, line, tree=tree))
 
 
 class _Scope(Expressions):

@@ -264,7 +264,7 @@ class Expressions:
 
 def _reverses(call: ast.Call, text: Text) -> bool:
     """Return whether a call checks the opposite of ``text``: check_not("..."), check("...", expected=False)."""
-    last = words_of(name_of(call.func))[-1]
+    last = (words_of(name_of(call.func)) or [""])[-1]
     reverses = last in PYTHON["reversed"] and last not in str(text).split()
     for each in call.keywords:
         if isinstance(each.value, ast.Constant) and isinstance(value := each.value.value, bool):
