@@ -153,10 +153,8 @@ def _own_motions(task: Task, steps: Sequence[PlanStep], held: Query) -> list[Pla
         return []
     guards = [_without_gripper(step.condition) for step in moving]
     guards[-1] = any_of([guards[-1], negate(any_of(guards))])
-    return [
-        step_of(Query(all_of([held.expression, guard])), role_of(step))
-        for step, guard in zip(moving, guards, strict=True)
-    ]
+    queries = [Query(all_of([held.expression, guard])) for guard in guards]
+    return [step_of(query, role_of(step)) for step, query in zip(moving, queries, strict=True)]
 
 
 def _lifted(task: Task, steps: Sequence[PlanStep]) -> Sequence[PlanStep]:

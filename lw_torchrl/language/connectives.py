@@ -84,9 +84,7 @@ _ENDS = {"and": ("neither",), "or": ("both", "neither"), "nor": ("both", "either
 
 
 def parse_words(
-    words: Sequence[str],
-    operand: Callable[[list[str]], Expression | None],
-    fail: Callable[[int, str], Exception],
+    words: Sequence[str], operand: Callable[[list[str]], Expression | None], fail: Callable[[int, str], Exception]
 ) -> Expression | None:
     """Parse a condition in English: "A or B", "not (A and B)", "neither A nor B", "A unless B", "once (A and B)".
 

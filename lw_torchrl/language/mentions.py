@@ -54,10 +54,9 @@ def mentions(text: str, task: Task) -> Mentions:
 def _mentions(text: str, task: Task) -> Mentions:
     subject, others = _noun_phrases(text.split(), task)
     subjects, objects = _referents(subject, task), [_referents(phrase, task) for phrase in others]
+    pairs = zip(others, objects, strict=True)
     unknown = [subject] if subject and not subjects else []
-    unknown += [
-        phrase for phrase, found in zip(others, objects, strict=True) if not found and not _PARTS.issuperset(phrase)
-    ]
+    unknown += [phrase for phrase, found in pairs if not found and not _PARTS.issuperset(phrase)]
     if others and not any(objects):
         unknown += others  # "near the edge", without the object
     joined = frozenset[str | None]().union(*objects) or frozenset((None,))
@@ -84,9 +83,8 @@ def _noun_phrases(words: list[str], task: Task) -> tuple[list[str], list[list[st
 
 
 def _is_empty(word: str, task: Task) -> bool:
-    return (
-        word in _EMPTY or word.isdigit() or (word.endswith("ly") and word not in _PLACES and word not in _names(task))
-    )
+    is_adverb = word.endswith("ly") and word not in _PLACES and word not in _names(task)
+    return word in _EMPTY or word.isdigit() or is_adverb
 
 
 def _kind(word: str, task: Task) -> str:

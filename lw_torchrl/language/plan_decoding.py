@@ -28,15 +28,7 @@ from lw_torchrl.language.library import expand
 from lw_torchrl.language.nearest import MappedQuery, StepMapper
 from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep, one_line
 from lw_torchrl.language.polarity import instruction
-from lw_torchrl.language.programs import (
-    Action,
-    Block,
-    Branch,
-    Done,
-    Node,
-    ProgramError,
-    tidy,
-)
+from lw_torchrl.language.programs import Action, Block, Branch, Done, Node, ProgramError, tidy
 from lw_torchrl.language.queries import MOST_CLAUSES, Query
 from lw_torchrl.language.roles import ignored_words
 from lw_torchrl.language.skills import Skills, canonical_skill
@@ -272,11 +264,9 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
     scripted, skill_distance = mapper.skill(words)
     if condition is None:
         dropped = "" if isinstance(clause.condition, str) else f"{shown(words)}: "
-        dropped += (
-            f"no query is near enough to the condition {shown(unknown[0])} (distance {distance:.2f})"
-            if unknown
-            else "the condition is never true, or it is too long"
-        )
+        first = shown(unknown[0]) if unknown else ""
+        far = f"no query is near enough to the condition {first} (distance {distance:.2f})"
+        dropped += far if unknown else "the condition is never true, or it is too long"
     if not text:
         dropped = f"the skill {shown(clause.skill)} commands no action"
     elif _SECOND_CONDITION.match(text):

@@ -6,17 +6,18 @@ This parser is strict. :func:`~lw_torchrl.decode_plan` is the tolerant parser fo
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from lw_torchrl._util.checks import did_you_mean, shown, typed
+from lw_torchrl._util.checks import check_value, did_you_mean, shown, typed
 from lw_torchrl._util.files import AnyPath, parse_json, read_text, write_text
 from lw_torchrl.language.nearest import LIMIT, nearest_query
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, PlanError, Plans, PlanStep, as_plans
-from lw_torchrl.language.queries import Query, QueryError, check_query
-from lw_torchrl.language.tasks import MT10, TASKS, Tasks
+from lw_torchrl.language.queries import QueryError, check_query
+from lw_torchrl.language.tasks import MT10, TASKS, Task, Tasks
 
 PLAN_LIMIT = 2**18  # characters of a plan's text, and bytes of a plan file; this bounds the parsing time
 _TEXT = r'"((?:[^"\\]|\\.)*)"|\'((?:[^\'\\]|\\.)*)\''
@@ -56,37 +57,28 @@ def parse_plan(text: str, task: str | None = None, source: str = "plan", tasks: 
 def check_plan(
     text: str, task: str | None = None, source: str = "plan", tasks: Tasks = TASKS
 ) -> tuple[ConditionalPlan | None, list[str]]:
-    """Parse a plan as :func:`parse_plan` does, but return (plan, []) or (None, all errors in line order) instead of
-    raising.
-    """
+    """Parse a plan like :func:`parse_plan`, but return (plan, []) or (None, all errors in line order)."""
     if len(text) > PLAN_LIMIT:
         return None, [f"{source}: a plan's text must have at most {PLAN_LIMIT} characters, got {len(text)}"]
-    name: str | None = None
-    condition: Query | None = None
-    is_open = False  # whether the last condition, valid or not, still has no skill
-    faults: list[str] = []
-    steps: list[PlanStep] = []
-    reason: list[str] = []
-    for number, raw in enumerate(text.splitlines(), 1):
-        line, where, fault = raw.strip(), f"{source}, line {number}", ""
+    name, condition, is_open = "", None, False  # is_open: whether the last condition, valid or not, has no skill yet
+    faults, steps, reason = list[str](), list[PlanStep](), list[str]()
+    for number, line in enumerate(map(str.strip, text.splitlines()), 1):
+        where, fault = f"{source}, line {number}", ""
         if not line:
             continue
         if line.startswith("#"):
-            if name is not None:
-                reason.append(line.lstrip("# "))
+            reason += [line.lstrip("# ")] if name else []
         elif match := _DEF.fullmatch(line):
-            if name is not None:
-                return None, [*faults, f"{where}: a second plan begins, but a plan file holds one plan"]
-            name = match[1].replace("__", "/").replace("_", "-")
-            if name not in tasks:
-                return None, [*faults, f"{where}: {shown(name)} is not a task{did_you_mean(name, tasks)}"]
-            if task is not None and name != task:
-                return None, [*faults, f"{where}: expected a plan for {task!r}, got a plan for {name!r}"]
-        elif name is None:
+            second, name = bool(name), match[1].replace("__", "/").replace("_", "-")
+            if second or name not in tasks or task not in (None, name):
+                unknown = f"{shown(name)} is not a task{did_you_mean(name, tasks)}"
+                other = unknown if name not in tasks else f"expected a plan for {task!r}, got a plan for {name!r}"
+                fault = "a second plan begins, but a plan file holds one plan" if second else other
+                return None, [*faults, f"{where}: {fault}"]
+        elif not name:
             fault = f"expected 'def task_name(robot):' before {shown(line)}"
         elif match := _CHECK.fullmatch(line):
-            if is_open:
-                fault = 'expected robot.verb("details") for the condition above, got a second condition'
+            fault = 'expected robot.verb("details") for the condition above, got a second condition' if is_open else ""
             is_open, condition = True, None
             try:
                 condition = check_query(_unquote(match, 1), tasks[name])
@@ -96,11 +88,9 @@ def check_plan(
             if not is_open:
                 fault = 'the skill has no condition; expected if check("condition"): above the skill'
             elif condition is not None:
-                goal = _unquote(match, 4)
                 try:
-                    reached = check_query(goal, tasks[name]) if goal else None
-                    skill = f"{match[1]} {_unquote(match, 2)}"
-                    steps.append(PlanStep(condition, skill, " ".join(reason), reached))
+                    reached = check_query(goal, tasks[name]) if (goal := _unquote(match, 4)) else None
+                    steps.append(PlanStep(condition, f"{match[1]} {_unquote(match, 2)}", " ".join(reason), reached))
                 except ValueError as error:
                     fault = f"goal: {error}"
             is_open, condition, reason = False, None, []
@@ -108,16 +98,12 @@ def check_plan(
             fault = f'expected a comment, if check("condition"): or robot.verb("details"), got {shown(line)}'
             if line.startswith("if"):
                 is_open, condition = True, None
-        if fault:
-            faults.append(f"{where}: {fault}")
-    if not faults and name is None:
-        faults.append(f"{source}: no plan found; a plan begins with 'def task_name(robot):'")
-    elif not faults and is_open:
-        faults.append(f"{source}: the last condition has no skill")
-    if faults or name is None:
-        return None, faults
+        faults += [f"{where}: {fault}"] if fault else []
+    if not faults and (not name or is_open):
+        absent = "the last condition has no skill" if name else "no plan found; it begins with 'def task_name(robot):'"
+        faults.append(f"{source}: {absent}")
     try:
-        return ConditionalPlan(name, tuple(steps), tasks[name]), []
+        return (None, faults) if faults else (ConditionalPlan(name, tuple(steps), tasks[name]), [])
     except PlanError as error:
         return None, [str(error)]
 
@@ -157,15 +143,13 @@ def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks
     if skills != "own":
         raise ValueError(f"skills={skills!r} only applies to source 'MT10' or 'MT50', got source {str(source)!r}")
     path = Path(source)
-    if not path.exists():
-        raise FileNotFoundError(f"no plan file or folder {str(path)!r}; 'MT10' and 'MT50' load the shipped plans")
-    if path.suffix == ".json":
+    if path.suffix == ".json" and path.exists():
         return _read_pairs(path, tasks)
     # Skip the temporary files of an interrupted save_plans, whose names start with a dot.
     paths = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
     if not paths:
-        hint = "use lw.decode_plan for a language model's answer, and lw.save_plans to write .plan files"
-        raise FileNotFoundError(f"the folder {str(path)!r} contains no .plan files; {hint}")
+        hint = "'MT10' and 'MT50' load the shipped plans, and lw.decode_plan reads a language model's answer"
+        raise FileNotFoundError(f"no plan file, or folder with .plan files, {str(path)!r}; {hint}")
     return _read_all(list[Traversable](paths), tasks)
 
 
@@ -191,57 +175,54 @@ def _read_pairs(path: Path, tasks: Tasks) -> Plans:
 
 def is_pairs(text: str) -> bool:
     """Return whether a text is JSON that maps names to lists of pairs, rather than a program in JSON."""
-    try:
-        content = parse_json(text.encode())
-    except ValueError:
-        return False
-    rows = content.get("plans", content)
-    return (
-        isinstance(rows, dict)
-        and bool(rows)
-        and all(isinstance(pairs, list) and all(isinstance(pair, list) for pair in pairs) for pairs in rows.values())
-    )
+    with suppress(ValueError):
+        rows = _rows(text)
+        listed = [*rows.values()] if isinstance(rows, dict) else []
+        return bool(listed) and all(
+            isinstance(pairs, list) and all(isinstance(x, list) for x in pairs) for pairs in listed
+        )
+    return False
+
+
+def _rows(text: str) -> Any:
+    content = parse_json(text.encode())
+    return content.get("plans", content)
 
 
 def check_pairs(text: str, source: str, tasks: Tasks = TASKS) -> tuple[list[ConditionalPlan], list[str]]:
-    """Parse JSON of (condition, skill) pairs, and return the plans and all errors.
-
-    A condition with a clause that is further than :data:`~lw_torchrl.language.nearest.LIMIT` from every query is an
-    error.
-    """
+    """Parse JSON of (condition, skill) pairs, and return the plans and all errors; each must be near a query."""
     try:
-        content = parse_json(text.encode())
+        rows = check_value("plans", _rows(text), dict)
     except ValueError as error:
         return [], [f"{source}: expected JSON that maps task names to lists of pairs: {error}"]
-    rows = content.get("plans", content)
-    if not isinstance(rows, dict):
-        return [], [f"{source}: expected task names mapped to (condition, skill) pairs, got {shown(rows)}"]
     plans, faults = list[ConditionalPlan](), list[str]()
     for name, pairs in rows.items():
+        steps, before = list[PlanStep](), len(faults)
         if name not in tasks:
             faults.append(f"{source}: {shown(name)} is not a task{did_you_mean(name, tasks)}")
             continue
-        steps, before = list[PlanStep](), len(faults)
         for number, pair in enumerate(pairs if isinstance(pairs, list) else [pairs], 1):
-            where = f"{source}, {name}, step {number}"
-            if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(text, str) for text in pair)):
-                faults.append(f"{where}: expected a pair of strings (condition, skill), got {shown(pair)}")
-                continue
             try:
-                match = nearest_query(pair[0], tasks[name])
-            except QueryError as error:
-                faults.append(f"{where}: {error}")
-                continue
-            if match.least_score < 1.0 - LIMIT:
-                distance = f"the distance of the nearest, {str(match.query)!r}, is {1.0 - match.least_score:.2f}"
-                faults.append(f"{where}: no query is near enough to the condition {shown(pair[0])} ({distance})")
-            steps.append(PlanStep(match.query, pair[1], "" if match.score == 1.0 else f"nearest to: {pair[0]}"))
-        if len(faults) == before:
-            try:
-                plans.append(ConditionalPlan(name, tuple(steps), tasks[name]))
-            except PlanError as error:
-                faults.append(f"{source}: {error}")
+                steps.append(_step_of(pair, tasks[name]))
+            except ValueError as error:
+                faults.append(f"{source}, {name}, step {number}: {error}")
+        try:
+            plans += [ConditionalPlan(name, tuple(steps), tasks[name])] if len(faults) == before else []
+        except PlanError as error:
+            faults.append(f"{source}: {error}")
     return plans, faults
+
+
+def _step_of(pair: Any, task: Task) -> PlanStep:
+    """Convert a (condition, skill) pair to a step whose condition is the nearest query."""
+    if not (isinstance(pair, list) and [*map(type, pair)] == [str, str]):
+        raise QueryError(f"expected a pair of strings (condition, skill), got {shown(pair)}")
+    condition, skill = pair
+    match = nearest_query(condition, task)
+    if match.least_score < 1.0 - LIMIT:
+        distance = f"the distance of the nearest, {str(match.query)!r}, is {1.0 - match.least_score:.2f}"
+        raise QueryError(f"no query is near enough to the condition {shown(condition)} ({distance})")
+    return PlanStep(match.query, skill, "" if match.score == 1.0 else f"nearest to: {condition}")
 
 
 @typed

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from lw_torchrl._util.checks import ArgumentError
+
 if TYPE_CHECKING:  # torch is imported lazily, since nearest_query needs only NumPy
     from torch import Tensor
 
@@ -87,13 +89,11 @@ def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
     """Encode texts with ``encoder`` (None for :func:`encode_texts`), check the vectors and return (n, E) float32."""
     import torch
 
-    if not callable(encoder or encode_texts):
-        raise TypeError(f"text_encoder must be a function from texts to a tensor, got {encoder!r:.80}")
     vectors = (encoder or encode_texts)(texts)
-    if not isinstance(vectors, torch.Tensor) or not vectors.is_floating_point():
-        raise TypeError(f"text_encoder must return a tensor of floats, got {vectors!r:.80}")
-    if vectors.ndim != 2 or len(vectors) != len(texts):
-        raise ValueError(f"text_encoder must return shape ({len(texts)}, E), got {tuple(vectors.shape)}")
+    if not isinstance(vectors, torch.Tensor) or not vectors.is_floating_point() or vectors.shape[:-1] != (len(texts),):
+        raise ArgumentError(
+            f"text_encoder must return a tensor of floats of shape ({len(texts)}, E), got {vectors!r:.80}"
+        )
     if not vectors.isfinite().all():
         wrong = texts[int((~vectors.isfinite()).any(-1).nonzero()[0])]
         raise ValueError(f"text_encoder must return finite numbers, got NaN or infinity for {wrong!r}")

@@ -1,4 +1,7 @@
-"""Plans for tests: written by hand, and drawn."""
+"""Plans for tests: written by hand, drawn, and from the tables beside the tests."""
+
+import tomllib
+from pathlib import Path
 
 from hypothesis import strategies as st
 
@@ -20,6 +23,11 @@ def drawer_open(robot):
         robot.pull_back('')
 """
 HEAD = 'def push(robot):\n    if check("the gripper is open"):\n        robot.push("the puck")\n'
+
+
+def read_table(file):
+    """Return the content of a TOML file beside the tests."""
+    return tomllib.loads((Path(__file__).parent / file).read_text("utf-8"))
 
 
 def plan(task="push", *pairs):

@@ -2,13 +2,12 @@
 
 import json
 import random
-import tomllib
-from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from plan_texts import read_table
 from speed import within
 
 import lw_torchrl as lw
@@ -25,30 +24,41 @@ formats = st.sampled_from(list(lw.PLAN_FORMATS))
 
 
 class Answer(NamedTuple):
-    """A row of answers.toml: an answer as models write it, and the expected reading."""
+    """A text as models write it, and the expected plan and notes."""
 
     task: str
-    format: str
     text: str
     steps: list[list[str]]  # the conditions as queries, and the skills as they are written
+    format: str | None = None
     notes: list[str] = []  # parts of notes, each with its line
     reason: str = ""
 
 
-ANSWERS = {
-    name: Answer(**row)
-    for name, row in tomllib.loads((Path(__file__).parent / "answers.toml").read_text("utf-8")).items()
-}
+def answers(file):
+    """Return the answers of a table in data by name; each text of a group of texts is an answer."""
+    found = {}
+    for name, row in read_table(file).items():
+        texts = row.pop("texts", None)
+        found |= (
+            {name: Answer(**row)}
+            if texts is None
+            else {f"{name} {number}": Answer(text=text, **row) for number, text in enumerate(texts, 1)}
+        )
+    return found
+
+
+ANSWERS = answers("answers.toml")
+TEXTS = {**ANSWERS, **answers("programs.toml"), **answers("rules.toml")}
 
 
 def decoded(name):
-    answer = ANSWERS[name]
+    answer = TEXTS[name]
     return lw.decode_plan(answer.text, answer.task, answer.format)
 
 
-@pytest.mark.parametrize("name", ANSWERS)
+@pytest.mark.parametrize("name", TEXTS)
 def test_answers_as_models_write_them(name):
-    answer, found = ANSWERS[name], decoded(name)
+    answer, found = TEXTS[name], decoded(name)
     steps = found.plan.steps if found.plan else ()
     assert [[str(step.condition), step.skill] for step in steps] == answer.steps
     assert answer.reason in found.reason
@@ -109,77 +119,12 @@ def test_thoughts_of_many_models(before, after):
     assert after or found.steps[0].line > before.count("\n") + draft.count("\n")
 
 
-DRAFT, RULE = "If the gripper is above the puck, lift the puck.", "If the gripper is near the puck, close the gripper."
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        f"A bad plan: {DRAFT}\n{RULE}",
-        f"✗ {DRAFT}\n✓ {RULE}",
-        f"Incorrect:\n- {DRAFT}\n\nMy plan:\n- {RULE}",
-        f"> {DRAFT}\n\n{RULE}",
-        f"<s>{DRAFT}</s>\n{RULE}",
-        f"```diff\n- {DRAFT}\n+ {RULE}\n```",
-        f"First version:\n```\n{DRAFT}\n```\nAnswer:\n```\n{RULE}\n```",
-        f"```\n{DRAFT}\n```\nThis was wrong.\n```\n{RULE}\n```",
-        f"1. {DRAFT}\n\nOops, this does not work. Let me try again.\n\n1. {RULE}",
-        f"- {DRAFT}\n\nPlease ignore the above.\n- {RULE}",
-        f"{DRAFT}\n\n**Revised plan**\n\n{RULE}",
-        f"- {DRAFT}\n\nHere is the improved version.\n- {RULE}",
-        f"# Rejected\n\n## Idea\n{DRAFT}\n\n# Plan\n{RULE}",
-        f"{RULE}\n\n### Old rules\n\n{DRAFT}",
-        f"Example:\n- {DRAFT}\n\nRules:\n- {RULE}",
-        f'The prompt says: "{DRAFT}"\n\n- {RULE}',
-        f"- {RULE}\n- Unlike “{DRAFT}” this is safe.",
-        f'{RULE}\n"{DRAFT}" would be dangerous.',
-    ],
-)
-def test_drafts_are_left_out_by_name(text):
-    decoded = lw.decode_plan(text, "push")
-    assert [step.skill for step in decoded.plan.steps] == ["close the gripper"]
-    assert "lift the puck" in " ".join(map(str, decoded.notes))
-
-
-@pytest.mark.parametrize("text", [f"> {RULE}", f"For example:\n```\n{RULE}\n```"])
-def test_an_answer_that_is_only_a_draft_is_read(text):
-    assert [step.skill for step in lw.decode_plan(text, "push").plan.steps] == ["close the gripper"]
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        f'- "{DRAFT}"\n- "{RULE}"',
-        f'Rule 1: "{DRAFT}"\nRule 2: "{RULE}"',
-        f"{DRAFT}\n\nThis is correct.\n\n{RULE}",
-        f"{DRAFT}\n\nThis does not work in the dark.\n\n{RULE}",
-        f"{DRAFT}\n\nFinal plan summary:\n{RULE}",
-        f"## Plan\n{DRAFT}\n\n## Better grip phase\n{RULE}",
-        f"- {DRAFT}\n- {RULE}\n\nFinal answer: see above.",
-    ],
-)
-def test_text_that_is_not_withdrawn_is_read(text):
-    skills = [step.skill for step in lw.decode_plan(text, "push").plan.steps]
-    assert skills == ["lift the puck", "close the gripper"]
-
-
 @pytest.mark.parametrize(
     "text", ["\n" * 65_000, "```\n" * 16_000, '"if ' + "," * 60_000, "# old\n" * 10_000, "a " * 32_000]
 )
 def test_drafts_are_found_in_linear_time(text):
     with within(3):
         assert without_drafts(text, []) is not None
-
-
-def test_items_of_a_list_in_html_are_rules():
-    decoded = lw.decode_plan(f"<ul><li>{DRAFT}<li>{RULE}</ul>", "push")
-    assert [step.skill for step in decoded.plan.steps] == ["lift the puck", "close the gripper"]
-
-
-def test_a_second_condition_is_not_part_of_the_skill():
-    decoded = lw.decode_plan(f"- When the gripper is open, if the sun shines, wave the hand.\n- {RULE}", "push")
-    assert [step.skill for step in decoded.plan.steps] == ["close the gripper"]
-    assert "sun" in " ".join(map(str, decoded.notes))
 
 
 @pytest.mark.parametrize("tag", ["</think>", "# </think>", "# <think>", "# done </think>", "# [/THINK]"])
@@ -199,11 +144,7 @@ def test_tags_in_json_are_ordinary_words():
     for tag in ("</think>", "<think>", "[THINK] x [/THINK]"):
         row = json.loads(write_structured(plan, PLAN_FORMATS["chain_py"].style))
         row["steps"][2]["because"] = f"Because. {tag}"
-        for text in (
-            json.dumps(row),
-            f"<think>Or {{}}?</think>{json.dumps(row)}",
-            f"```json\n{json.dumps(row)}\n```",
-        ):
+        for text in (json.dumps(row), f"<think>Or {{}}?</think>{json.dumps(row)}", f"```json\n{json.dumps(row)}\n```"):
             found = decode_as(text, read_structured, StepMapper(lw.TASKS["push"], None))
             assert found.plan == plan
 
@@ -257,25 +198,6 @@ def test_the_scripted_plan_has_the_task_s_nearest_skills():
     assert found.steps[3].scripted is None
     assert any("no scripted skill is near enough to 'xyzzy qqq'" in note.text for note in found.notes)
     lw.ScriptedSkillActor(lw.Plans([found.scripted]))
-
-
-@pytest.mark.parametrize(
-    ("condition", "query"),
-    [
-        ("the robot's gripper is holding the puck", f"{GRIPPER} around the puck"),
-        ("the puck is at the goal", "the puck is near the target location"),
-        ("the puck is not in the target area", "the puck is not near the target location"),
-        ("the gripper is on top of the puck", f"{GRIPPER} above the puck"),
-        ("the puck is on the table", "the puck is touching the table"),
-        ("the puck is to the left of the gripper", "the puck is left of the robot's gripper"),
-        ("the puck is next to the goal position", "the puck is near the target location"),
-    ],
-)
-def test_conditions_in_models_words(condition, query):
-    found = lw.decode_plan(f'if check("{condition}"):\n    robot.push("puck")', "push", "basic_py")
-    assert str(found.plan.steps[0].condition) == query
-    assert found.steps[0].condition_distance == 0.0
-    assert f"is read as {query!r}" in str(found.notes[0])
 
 
 @pytest.mark.parametrize(
@@ -402,29 +324,3 @@ def test_steps_beyond_the_limit_are_left_out():
     found = lw.decode_plan("if check('gripper open'):\n robot.a()\n" * 1_500, "push", "basic_py")
     assert len(found.plan.steps) == len(found.steps) == 1_000
     assert "line 2001: the plan has more than 1000 steps; 500 are left out" in map(str, found.notes)
-
-
-WRAPPED = """
-- If the gripper is not above the puck and the
-gripper is open, then place the gripper above the
-puck.
-- Recite a poem about robots.
-- Never, if the gripper is open, lift the puck.
-- When the gripper is near the puck, close the gripper.
-"""
-
-
-def test_wrapped_lines_are_joined_and_lines_without_a_rule_are_named():
-    decoded = lw.decode_plan(WRAPPED, "push")
-    assert [step.skill for step in decoded.plan.steps] == ["place the gripper above the puck", "close the gripper"]
-    notes = "\n".join(map(str, decoded.notes))
-    assert "Recite a poem about robots" in notes
-    assert "lift the puck" in notes
-
-
-@pytest.mark.parametrize("key", ["never", "do_not", "avoid"])
-def test_actions_under_keys_that_forbid_are_left_out_by_name(key):
-    text = json.dumps({"rules": [{"when": "gripper open", "do": "close the gripper"}, {key: "lift the puck"}]})
-    decoded = lw.decode_plan(text, "push")
-    assert [step.skill for step in decoded.plan.steps] == ["close the gripper"]
-    assert "lift the puck" in "\n".join(map(str, decoded.notes))

@@ -385,7 +385,7 @@ def test_a_condition_of_a_pair_becomes_the_nearest_query_or_is_refused(tmp_path_
         ("{", "expected JSON"),
         ("[" * 100_000, "nested too deeply"),
         ([], "must be an object, got list"),
-        ({"plans": 3}, "expected task names"),
+        ({"plans": 3}, "plans must be a dict, got 3"),
         ({"pusch": []}, "'pusch' is not a task; did you mean 'push'"),
         ({"push": {}}, "push, step 1"),
         ({"push": [["gripper is open"]]}, "push, step 1"),

@@ -104,23 +104,3 @@ def test_spellings_of_a_sequence_with_memory():
     without = lw.decode_plan(json.dumps({"type": "sequence", **TREE}), "push").plan
     assert without is not None
     assert not any(step.condition.has_latch for step in without.steps)
-
-
-def test_prose_that_remembers():
-    text = (
-        "Once the puck has been near the target location, open the gripper. "
-        "Otherwise, if the gripper has not been near the puck, move to the puck. Otherwise close the gripper."
-    )
-    plan = lw.decode_plan(text, "push").plan
-    assert plan is not None
-    assert [str(step.condition) for step in plan.steps] == [
-        "the puck has been near the target location",
-        "the puck has not been near the target location and the robot's gripper has not been near the puck",
-        "the puck has not been near the target location and the robot's gripper has been near the puck",
-    ]
-
-
-def test_once_without_the_perfect_tense_is_the_present():
-    plan = lw.decode_plan("Once the gripper is near the puck, close the gripper. Otherwise open it.", "push").plan
-    assert plan is not None
-    assert not any(step.condition.has_latch for step in plan.steps)

@@ -74,9 +74,7 @@ def test_shipped_plans_have_no_ignored_words(skills):
 
 
 @given(
-    st.sampled_from(sorted(OWN)),
-    st.sampled_from(["four times", "twice", "like crazy", "until midnight"]),
-    st.data(),
+    st.sampled_from(sorted(OWN)), st.sampled_from(["four times", "twice", "like crazy", "until midnight"]), st.data()
 )
 def test_words_that_no_step_can_express_are_named_and_change_no_role(task, words, data):
     plan = OWN[task]

@@ -1,12 +1,11 @@
 """JSON and YAML of any shape: the structure and the texts determine the plan, not the names of the keys."""
 
 import json
-import tomllib
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plan_texts import read_table
 from speed import within
 
 import lw_torchrl as lw
@@ -16,8 +15,7 @@ from lw_torchrl.language.formats.values import parse_value
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.programs import compile_program
 
-TEXTS = [Path(__file__).parent / name for name in ("tree_shapes.toml", "program_shapes.toml")]
-SHAPES = {name: shape for path in TEXTS for name, shape in tomllib.loads(path.read_text("utf-8")).items()}
+SHAPES = read_table("tree_shapes.toml") | read_table("program_shapes.toml")
 
 
 def active_verbs(plan, near, is_open):
@@ -46,9 +44,7 @@ def test_every_shape_of_a_policy_is_the_same_plan(name):
 
 FACTS = {"a": "gripper near puck", "b": "gripper open", "c": "puck above wall", "d": "puck near target location"}
 policies = st.recursive(
-    st.integers(0, 99),
-    lambda inner: st.tuples(st.sampled_from("abcd"), st.booleans(), inner, inner),
-    max_leaves=6,
+    st.integers(0, 99), lambda inner: st.tuples(st.sampled_from("abcd"), st.booleans(), inner, inner), max_leaves=6
 )
 KEYS = [("if", "then", "else"), ("query", "on_true", "on_false"), ("situation", "response", "otherwise"),
         ("when", "run", "default"), ("Is it so", "yes", "no")]  # fmt: skip
@@ -164,55 +160,6 @@ def test_the_steps_of_a_subgoal_run_until_it_is_achieved(key):
     ]
 
 
-def test_an_unknown_condition_among_rules_is_not_a_title():
-    rules = {"Monday comes": "close the gripper", "gripper near puck": "push the puck", "otherwise": "lift the puck"}
-    plan = lw.decode_plan(json.dumps(rules), "push").plan
-    assert [(str(step.condition), step.skill) for step in plan.steps] == [
-        (NEAR, "push the puck"),
-        (NOT_NEAR, "lift the puck"),
-    ]
-
-
-def test_actions_without_a_place_in_the_program_are_named():
-    text = (
-        '{"if": "gripper open", "then": "close the gripper", "goal": "done", "extras": {"until": "push the puck away"}}'
-    )
-    notes = "\n".join(map(str, lw.decode_plan(text, "push").notes))
-    assert "'push the puck away' is left out" in notes
-
-
-ALTERNATIVES = """
-def reach(hand, puck):
-    if np.linalg.norm(hand[:2] - puck[:2]) > 0.02:
-        return "move above the puck"
-    return None
-
-def policy(hand, puck):
-    {}
-"""
-
-
-@pytest.mark.parametrize(
-    "line", ["return reach(hand, puck) or 'grasp the puck'", "return reach(hand, puck) or robot.grasp('the puck')"]
-)
-def test_the_first_helper_that_returns_an_action_acts(line):
-    decoded = lw.decode_plan(ALTERNATIVES.format(line), "push")
-    aligned = "the robot's gripper is vertically aligned with the puck"
-    assert [(str(step.condition), step.skill) for step in decoded.plan.steps] == [
-        (aligned.replace("is", "is not", 1), "move above the puck"),
-        (aligned, "grasp the puck"),
-    ]
-
-
-def test_texts_of_actions_that_no_path_reaches_are_named():
-    lines = ["if near(hand, puck): return 'grasp the puck'", "plan = memory.pop() @ 'lift the puck'"]
-    decoded = lw.decode_plan(ALTERNATIVES.format("\n    ".join(lines)), "push")
-    assert [step.skill for step in decoded.plan.steps] == ["grasp the puck"]
-    notes = "\n".join(map(str, decoded.notes))
-    assert "'lift the puck'" in notes
-    assert "'reach' was not requested; 1 step left out" in notes
-
-
 DRAFT = {"when": "gripper near puck", "do": "lift the puck"}
 RULE = {"when": "gripper near puck", "do": "grasp the puck"}
 
@@ -224,17 +171,6 @@ def test_what_is_not_a_part_of_the_plan_is_left_out_with_a_note(key, value):
         decoded = lw.decode_plan(json.dumps(row), "push")
         assert [step.skill for step in decoded.plan.steps] == ["grasp the puck"]
         assert any("lift the puck" in note.text and key in note.text for note in decoded.notes)
-
-
-def test_a_rule_that_is_marked_as_a_draft_is_left_out_with_a_note():
-    decoded = lw.decode_plan(json.dumps([{**DRAFT, "draft": True}, {**RULE, "draft": False}]), "push")
-    assert [step.skill for step in decoded.plan.steps] == ["grasp the puck"]
-    assert any("lift the puck" in note.text for note in decoded.notes)
-
-
-def test_an_example_without_a_plan_is_read():
-    decoded = lw.decode_plan(json.dumps({"example": [RULE]}), "push")
-    assert [step.skill for step in decoded.plan.steps] == ["grasp the puck"]
 
 
 HOSTILE = {

@@ -40,17 +40,6 @@ class PlanFormat:
     style: Style = Style()  # used for models that are constrained to a JSON Schema
 
 
-@dataclass(frozen=True)
-class Styled:
-    """A function whose last argument is a style; unlike a lambda, it can be pickled and compared."""
-
-    function: Callable[..., str]
-    style: Style
-
-    def __call__(self, *arguments: Any) -> str:
-        return self.function(*arguments, self.style)
-
-
 PROGRAM_WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "programs.toml", ValueError)
 """The words by which the readers recognize programs."""
 
@@ -110,10 +99,6 @@ class Reading:
     def note(self, line: int, text: str) -> None:
         """Append a note on a line."""
         self.notes.append(Note(line, text))
-
-    def add_tree(self, task: str, line: int, tree: Node) -> None:
-        """Append a section with a program."""
-        self.sections.append(Section(task, line, tree=tree))
 
     def open(self, task: str, line: int) -> None:
         """Begin a section for a task, unless a ``def`` follows right below a heading for the same task."""

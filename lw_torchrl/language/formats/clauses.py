@@ -35,8 +35,7 @@ PATTERNS = {  # a part is written in angle brackets
     name: _compiled(re.sub(r"<(\w+)>", lambda part: _PARTS.get(part[1], part[0]), pattern))
     for name, pattern in _WORDS["patterns"].items()
 }
-RELATION, REPEAT, GO_TO, ENDS = (PATTERNS[name] for name in ("relation", "repeat", "go_to", "ends"))
-_LEAD, _JOINT, _IS_MODAL = (PATTERNS[name] for name in ("lead", "joint", "is_modal"))
+RELATION, _LEAD, _JOINT, _IS_MODAL = (PATTERNS[name] for name in ("relation", "lead", "joint", "is_modal"))
 _CONNECTIVES = {role: _compiled(_any(words) + r"\b") for role, words in _WORDS["connectives"].items()}
 _ANSWERS = {
     role: _compiled(_any(words) + (r"\b" if role in ("else", "rest", "case") else PATTERNS["end"].pattern))
@@ -135,11 +134,8 @@ def _is_cut(before: str, rest: str) -> bool:
         return False
     if joint[1].lower() == "and" and action(before) and inner.split()[0].lower() not in PROGRAM_WORDS["motions"]:
         return False  # "move it to the mug and hook it" is one action
-    return (
-        is_action(inner)
-        or bool(PATTERNS["asks"].match(inner))
-        or (joint[1].lower() in ("so", "then") and bool(action(inner)))
-    )
+    is_result = joint[1].lower() in ("so", "then") and bool(action(inner))
+    return is_result or is_action(inner) or bool(PATTERNS["asks"].match(inner))
 
 
 def _clause(text: str, stop: str) -> Iterator[Clause]:
@@ -160,15 +156,8 @@ def _clause(text: str, stop: str) -> Iterator[Clause]:
                 return
             continue
         if match := _LEAD.match(text):
-            text, joint = (
-                text[match.end() :],
-                joint
-                or (
-                    "then"
-                    if match[0].lower().startswith(("then", "first", "second", "third", "next", "finally", "last"))
-                    else ""
-                ),
-            )
+            orders = match[0].lower().startswith(("then", "first", "second", "third", "next", "finally", "last"))
+            text, joint = text[match.end() :], joint or "then" * orders
             continue
         break
     if not text:
@@ -214,7 +203,7 @@ def _action_at(text: str) -> int:
 
 def _main(text: str, stop: str) -> Clause:
     """Return a clause without a connective."""
-    if REPEAT.match(text):
+    if PATTERNS["repeat"].match(text):
         return Clause("say", text, "", stop)
     if match := PATTERNS["asks"].match(text):
         return Clause("ask", match[1] or match[2], "", stop, "check")

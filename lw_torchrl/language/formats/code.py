@@ -13,40 +13,17 @@ from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any
 from lw_torchrl.language.formats.base import (
     PROGRAM_WORDS,
     Reading,
+    Section,
     code_blocks,
     is_for_any_task,
     is_verb,
     task_name,
     words_of,
 )
-from lw_torchrl.language.formats.code_expressions import (
-    PYTHON,
-    Expressions,
-    is_carrier,
-    is_check,
-    is_owner,
-    name_of,
-)
-from lw_torchrl.language.formats.code_values import (
-    Choice,
-    Name,
-    Text,
-    Value,
-    action,
-    chosen,
-    joined,
-)
+from lw_torchrl.language.formats.code_expressions import PYTHON, Expressions, is_carrier, is_check, is_owner, name_of
+from lw_torchrl.language.formats.code_values import Choice, Name, Text, Value, action, chosen, joined
 from lw_torchrl.language.formats.python import state_to_reach
-from lw_torchrl.language.programs import (
-    Action,
-    Block,
-    Branch,
-    Jump,
-    Label,
-    Loop,
-    Node,
-    actions_of,
-)
+from lw_torchrl.language.programs import Action, Block, Branch, Jump, Label, Loop, Node, actions_of
 
 _COMMENTS = PROGRAM_WORDS["keys"]["comment"]
 _MOST_REPAIRS = 8  # maximum number of syntax errors to repair by cutting off code
@@ -161,7 +138,7 @@ class Module:
         """Add a section with the tree of the given statements, without calls to the functions in ``roots``."""
         tree = _Scope(self, dict(self.constants.values), roots).block(body)
         if next(actions_of(tree), None) is not None:
-            self.reading.add_tree(task, line, tree)
+            self.reading.sections.append(Section(task, line, tree=tree))
 
 
 class _Scope(Expressions):

@@ -196,10 +196,8 @@ class Expressions:
 
     def comparison(self, node: ast.Compare, left: ast.expr, op: ast.cmpop, right: ast.expr) -> Expression | None:
         """Convert a comparison with a truth value, a threshold, or the text of a variable to a condition."""
-        differs, is_equality = (
-            isinstance(op, ast.NotEq | ast.IsNot),
-            isinstance(op, ast.Eq | ast.Is | ast.NotEq | ast.IsNot),
-        )
+        differs = isinstance(op, ast.NotEq | ast.IsNot)
+        is_equality = differs or isinstance(op, ast.Eq | ast.Is)
         value, other = self.value(left), self.value(right)
         condition: Expression | None = None
         number = right.value if isinstance(right, ast.Constant) else None
@@ -242,7 +240,7 @@ class Expressions:
         is_sentence = len(words) > 2 or any(isinstance(each, str) and len(each.split()) > 3 for each in words)
         if words and (is_check(node) or is_sentence):
             return joined(words)
-        receiver, name = self.receiver(node.func), words_of(name_of(node.func))
+        receiver, name = self.receiver(node.func), words_of(name_of(node.func)) or [""]
         name += ["from"] * (name[-1] == "far")
         if words and name[-1] not in _RELATIONS and not is_noun(str(receiver)) and is_noun(str(words[0])):
             receiver = ""  # "vision.is_closed(gripper)"
@@ -266,7 +264,7 @@ class Expressions:
 
 def _reverses(call: ast.Call, text: Text) -> bool:
     """Return whether a call checks the opposite of ``text``: check_not("..."), check("...", expected=False)."""
-    last = words_of(name_of(call.func))[-1]
+    last = (words_of(name_of(call.func)) or [""])[-1]
     reverses = last in PYTHON["reversed"] and last not in str(text).split()
     for each in call.keywords:
         if isinstance(each.value, ast.Constant) and isinstance(value := each.value.value, bool):

@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeAlias
 
 from lw_torchrl._util.checks import counted, shown
 from lw_torchrl.language.expressions import (
@@ -34,13 +34,10 @@ from lw_torchrl.language.skills import canonical_skill
 from lw_torchrl.language.step_parser import skill_effect
 from lw_torchrl.language.tasks import TASKS, Task
 
+_Reader: TypeAlias = Callable[[str], Reading]
 _MOST_COMPARED = 16  # maximum number of conditions in a guard that is compared with an effect
 # Models sometimes answer in a format that was not requested, so every group of readers is tried.
-_GROUPS: tuple[tuple[Callable[[str], Reading], ...], ...] = (
-    (TreeReading,),
-    (PythonReading, CodeReading),
-    (ProseReading, SentenceReading),
-)
+_GROUPS: list[tuple[_Reader, ...]] = [(TreeReading,), (PythonReading, CodeReading), (ProseReading, SentenceReading)]
 _CONTROL_WORDS = re.compile(r"\b(?:otherwise|or else|else,|unless)\b|\bgo (?:on |back )?to step\b", re.IGNORECASE)
 
 
@@ -55,7 +52,7 @@ _PRONOUN = re.compile(
 _ABOUT_IT = re.compile(rf"^[^\w\n]{{0,20}}(?:\d+[^\w\n]{{1,9}})?{_IT}", re.IGNORECASE | re.MULTILINE)
 
 
-def read_any(text: str, mapper: StepMapper, read: Callable[[str], Reading] | None) -> tuple[Reading, Section]:
+def read_any(text: str, mapper: StepMapper, read: _Reader | None) -> tuple[Reading, Section]:
     """Parse a text with the first group of readers that finds clauses for the task.
 
     Of this group, return the reading that keeps the most actions, and the section of that reading for the task.
@@ -83,15 +80,11 @@ def read_any(text: str, mapper: StepMapper, read: Callable[[str], Reading] | Non
                 other = first  # prose without any condition is not a plan
             empty.append(other)
             known = mapper if is_free else None
-            best = max(
-                first,
-                other,
-                key=lambda pair: (
-                    _kept(pair[1], known),
-                    pair is other and is_about_it,
-                    -len(section_notes(pair[0], pair[1], mapper.task)),
-                ),
-            )
+            ranks = [
+                (_kept(pair[1], known), pair is other and is_about_it, -len(section_notes(*pair, mapper.task)))
+                for pair in (first, other)
+            ]
+            best = other if ranks[1] > ranks[0] else first
         if best[1].clauses:
             best[0].notes += asides
             if number and read is not None:
@@ -102,9 +95,7 @@ def read_any(text: str, mapper: StepMapper, read: Callable[[str], Reading] | Non
     )
 
 
-def _with_clauses(
-    read: Callable[[str], Reading], text: str, mapper: StepMapper, any_name: bool = False
-) -> tuple[Reading, Section]:
+def _with_clauses(read: _Reader, text: str, mapper: StepMapper, any_name: bool = False) -> tuple[Reading, Section]:
     """Parse a text and compile the programs for the task; return the reading and the section with the most clauses.
 
     With ``any_name``, functions that are not named after any task are used if none has the task's name.

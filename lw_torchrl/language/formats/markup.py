@@ -115,8 +115,6 @@ def _tables(lines: list[str]) -> None:
         if columns is None:
             continue
         is_row = len(cells) > max(columns) and re.search(r"\w", row)
-        states = [
-            cells[columns[0]],
-            *(f"the {heads[at]} is {cells[at]}" for at in nouns if re.search(r"\w", cells[at])),
-        ]
-        lines[number] = rule_sentence(" and ".join(states), cells[columns[1]]) if is_row else ""
+        facts = [f"the {heads[at]} is {cells[at]}" for at in nouns if re.search(r"\w", cells[at])]
+        condition = " and ".join([cells[columns[0]], *facts])
+        lines[number] = rule_sentence(condition, cells[columns[1]]) if is_row else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from lw_torchrl._util.checks import shown
-from lw_torchrl.language.formats.base import END, PROGRAM_WORDS, Reading, is_verb
+from lw_torchrl.language.formats.base import END, PROGRAM_WORDS, Reading, Section, is_verb
 from lw_torchrl.language.formats.clauses import PATTERNS, RELATION, clauses, is_action, is_state
 from lw_torchrl.language.formats.line_parser import Choice, LineParser, Open, Part, Repeat
 from lw_torchrl.language.formats.markup import WHEN
@@ -60,7 +60,7 @@ class SentenceReading(Reading):
         is_in_turn = self.step and (self.has_jumps or not all(isinstance(part, Choice) for part in steps))
         tree = Sequence(tuple(_built(self.root))) if is_in_turn else Block(tuple(_built(steps)))
         if next(actions_of(tree), None) is not None:
-            self.add_tree("", 1, tree)
+            self.sections.append(Section("", 1, tree=tree))
 
     def read(self, line: str, following: str, is_heading: bool) -> None:
         """Add the clauses of a line, at the depth of its indent."""

@@ -1,6 +1,7 @@
 """Values of JSON, YAML and XML in the few shapes that the reader of trees knows.
 
 Tables with a header, flowcharts, rows with priorities, rules in strings and JSON in strings become lists and objects.
+The fields of an object are tests, goals, facts, programs, definitions or answers.
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ from typing import Any
 from lw_torchrl.language.formats.base import PROGRAM_WORDS
 from lw_torchrl.language.formats.phrases import (
     ROLES,
+    STRUCTURE,
     is_bare,
     is_command,
     is_comparator,
+    is_noun,
     is_predicate,
     is_statement,
     is_told,
@@ -25,6 +28,7 @@ from lw_torchrl.language.formats.phrases import (
     truth_of,
 )
 from lw_torchrl.language.formats.values import parse_value
+from lw_torchrl.language.relations import PREDICATES
 
 MOST_VALUES, MOST_DEPTH = 20_000, 200  # YAML's references can repeat a value
 _MOST_FIELDS = 30  # of an object with a table and its header
@@ -123,6 +127,59 @@ def mentions(value: Any, names: Collection[str]) -> bool:
     keys = value if isinstance(value, dict) else ()
     said = [text for key, text in texts_in([value]) if role_of(key) not in ("type", "act")]
     return any(str(key) in names for key in keys) or any(text in names for text in said)
+
+
+def is_facts(value: Any) -> bool:
+    """Return whether an object states facts: {"near": ["gripper", "mug"], "gripper": "closed"}."""
+    return isinstance(value, dict) and all(
+        (is_noun(str(key)) and (isinstance(each, dict) or is_predicate(str(each))))
+        or (is_predicate(str(key)) and isinstance(each, list) and len(each) > 1)
+        for key, each in value.items()
+    )
+
+
+def is_goal(key: Any) -> bool:
+    return plain(str(key)).rpartition(" ")[2] in PROGRAM_WORDS["prose"]["goals"]
+
+
+def is_test(key: Any, value: Any) -> bool:
+    role = role_of(str(key))
+    return role == "test" or (role not in ("name", "comment", "act") and states(value) and not has_action(value))
+
+
+def is_program(key: str, value: Any) -> bool:
+    """Return whether the value of a label is a program: {"task": {"if": ..., "then": ...}}."""
+    if isinstance(value, dict) and role_of(key) != "comment":
+        return True
+    rows = [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []
+    return any(has_action(row) and any(role_of(str(key)) in STRUCTURE for key in row) for row in rows)
+
+
+def is_always(text: str) -> bool:
+    return text.lower().strip(" .") in PROGRAM_WORDS["always"]
+
+
+def is_reserved(name: str, value: Any) -> bool:
+    """Return whether a name has another meaning than its definition."""
+    is_word = plain(name) in ROLES or is_always(name)
+    is_object = is_noun(name) and not any(is_told(text) for _, text in texts_in(value))
+    is_relation = plain(name) in PREDICATES and not (isinstance(value, str) and is_told(value))
+    return not name or is_word or is_object or is_relation
+
+
+def is_skipped(row: dict[Any, Any], key: str, value: Any) -> bool:
+    """Return whether a field can be ignored: {"else": true}, or definitions, which are read where they are named."""
+    if value is None:
+        return not is_command(key)
+    role = role_of(key)
+    is_named = isinstance(value, list) and all(isinstance(each, str) for each in value)  # names of definitions
+    return (role == "definitions" and len(row) > 1 and not is_named) or (role == "else" and truth_of(value) is not None)
+
+
+def is_answer(row: dict[Any, Any]) -> bool:
+    """Return whether an object contains the branches of a separate condition: {"true": ..., "false": ...}."""
+    roles = {role_of(str(key)) for key in row}
+    return "else" in roles and roles <= {"act", "else"}
 
 
 def names_of(rows: list[Any], counts: Counter[str], fields: Counter[tuple[str, str]]) -> list[str]:

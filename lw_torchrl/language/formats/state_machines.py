@@ -6,13 +6,38 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 from lw_torchrl.language.expressions import TRUE, Expression, all_of, any_of, negate
-from lw_torchrl.language.formats.fields import is_machine, named, source, transitions_of
-from lw_torchrl.language.formats.phrases import is_told, role_of
+from lw_torchrl.language.formats.phrases import is_statement, is_told, plain, role_of
 from lw_torchrl.language.formats.shapes import mentions, texts_in
 from lw_torchrl.language.programs import Branch, Done, Node, Selector, actions_of
 
 if TYPE_CHECKING:
     from lw_torchrl.language.formats.trees import Tree
+
+
+def transitions_of(value: Any) -> dict[Any, Any]:
+    """Return the fields of an object that hold transitions between states."""
+    rows = value.items() if isinstance(value, dict) else ()
+    return {key: each for key, each in rows if role_of(str(key)) == "transitions"}
+
+
+def is_machine(members: list[Any], names: Collection[str]) -> bool:
+    """Return whether a transition in a table's members leads to one of the members' names."""
+    return any(mentions(value, names) for each in members for value in transitions_of(each).values()) or any(
+        text in names and (role_of(key) == "transitions" or is_statement(key)) for key, text in texts_in(members)
+    )
+
+
+def named(value: Any) -> str:
+    """Return the name that an object gives itself: {"id": "grasp"}."""
+    rows = value.items() if isinstance(value, dict) else ()
+    return next((str(each) for key, each in rows if plain(str(key)) in ("id", "name", "key", "state")), "")
+
+
+def source(value: Any) -> str:
+    """Return the name of the state that a transition leaves."""
+    if isinstance(value, dict):
+        return str(value.get("from", value.get("source", named(value))))
+    return str(value[0]) if isinstance(value, list) and value else ""
 
 
 def machine(tree: Tree, row: dict[Any, Any]) -> Node | None:

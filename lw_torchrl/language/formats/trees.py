@@ -17,18 +17,15 @@ from typing import Any
 from lw_torchrl._util.checks import shown
 from lw_torchrl.language.connectives import parse_words
 from lw_torchrl.language.expressions import FALSE, TRUE, Expression, all_of, any_of, as_expression, negate
-from lw_torchrl.language.formats.base import PROGRAM_WORDS, Reading, code_blocks, command, in_turn, statement, words_of
-from lw_torchrl.language.formats.fields import (
-    is_always,
-    is_answer,
-    is_facts,
-    is_goal,
-    is_machine,
-    is_program,
-    is_reserved,
-    is_skipped,
-    is_test,
-    transitions_of,
+from lw_torchrl.language.formats.base import (
+    PROGRAM_WORDS,
+    Reading,
+    Section,
+    code_blocks,
+    command,
+    in_turn,
+    statement,
+    words_of,
 )
 from lw_torchrl.language.formats.phrases import (
     ROLES,
@@ -52,13 +49,21 @@ from lw_torchrl.language.formats.shapes import (
     MOST_VALUES,
     RULE,
     has_action,
+    is_always,
+    is_answer,
+    is_facts,
+    is_goal,
+    is_program,
+    is_reserved,
+    is_skipped,
+    is_test,
     names_of,
     states,
     texts_in,
     usual_shape,
     values_in,
 )
-from lw_torchrl.language.formats.state_machines import machine
+from lw_torchrl.language.formats.state_machines import is_machine, machine, transitions_of
 from lw_torchrl.language.formats.values import parse_value
 from lw_torchrl.language.polarity import command_form, forbids, instruction
 from lw_torchrl.language.programs import (
@@ -119,7 +124,7 @@ class TreeReading(Reading):
             tree.note_lost(value, texts)
             is_program = "{" in str(value) or _has_condition(node) or all(map(is_told, texts))  # not a list in prose
             if node is not None and texts and is_program:
-                self.add_tree("", start + 1, node)
+                self.sections.append(Section("", start + 1, tree=node))
 
     def without_asides(self, value: Any, start: int, text: str) -> Any:
         """Remove thoughts, examples and comments, unless no action remains, and note those that may be rules."""
