@@ -3,7 +3,7 @@
 from hypothesis import strategies as st
 
 from lw_torchrl.language.expressions import Once, all_of, any_of, fold, negate
-from lw_torchrl.language.queries import Query, parse_query
+from lw_torchrl.language.queries import Query, parse_query, supported_queries
 
 
 def trees(leaves, most=12):
@@ -52,6 +52,15 @@ def query_of(tree, task):
         return (all_of if operator == "all" else any_of)([build(part) for part in parts])
 
     return Query(build(tree))
+
+
+def tower(task, levels=30, width=64):
+    """Return an expression with ``width`` alternatives at each level, whose text has exponential length."""
+    clauses = [parse_query(text, task).expression for text in supported_queries(task)[: 2 * width : 2]]
+    tip = clauses[0]
+    for _ in range(levels):
+        tip = negate(all_of([any_of([tip, clause]) for clause in clauses]))
+    return tip
 
 
 def text_of(tree):

@@ -44,27 +44,7 @@ def without_roles(plan):
     return replace(plan, steps=tuple(replace(step, role=None) for step in plan.steps))
 
 
-@pytest.mark.parametrize(
-    ("task", "condition", "text", "verb", "moved", "target", "direction"),
-    [
-        ("push", "gripper is closed", "carry the puck over to the goal", "carry", "puck", GOAL, None),
-        ("push", "gripper is open", "nudge the puck forward", "push", G, "puck", "away"),
-        ("push", "gripper is not near the puck", "grab the puck", "descend", G, "puck", None),
-        ("push", "gripper is near the puck", "grab it", "close", G, "puck", None),
-        ("push", "gripper is near the puck", "grip a puck", "close", G, "puck", None),
-        ("push", "gripper is open", "let go of the puck with the gripper", "open", G, "puck", None),
-        ("push", "gripper is open", "position gripper over puck", "approach", G, "puck", None),
-        ("push", "gripper is open", "put the hand around the puck", "descend", G, "puck", None),
-        ("dial-turn", "gripper is open", "turn the dial", "push", G, "dial", "goal"),
-        ("dial-turn", "gripper is open", "rotate the dial left", "push", G, "dial", "left"),
-        ("drawer-open", "gripper is open", "pull drawer open", "pull", G, "drawer handle", "goal"),
-        ("drawer-close", "gripper is open", "gripper in front of drawer", "beside", G, "drawer handle", "away"),
-        ("handle-press-side", "gripper is open", "press the handle down", "push", G, "handle", "down"),
-        ("handle-pull-side", "gripper is open", "lift the handle", "move", "handle", "handle", "up"),
-        ("reach", "gripper is open", "reach toward the goal", "reach", G, GOAL, None),
-        ("reach", "gripper is open", "stay at the target", "hold", G, GOAL, None),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(('task', 'condition', 'text', 'verb', 'moved', 'target', 'direction'), CASES["steps"])
 def test_the_verb_objects_and_direction_of_a_step(task, condition, text, verb, moved, target, direction):
     (step,) = parse_steps(plan_of(task, (condition, text)))
     assert (step.verb, step.moved, step.target, step.direction) == (verb, moved, target, direction)
