@@ -62,12 +62,14 @@ def test_a_query_matches_itself_also_if_it_is_misspelt(data, task):
     assert (str(match.query), match.score) == (" and ".join(picked), 1.0)
     assert [str(part.query) for part in match.parts] == picked
     meant = data.draw(st.sampled_from([text for text in supported_queries(task) if " above " in text]))
-    match = nearest_query(meant.replace("above", data.draw(st.sampled_from(["abov", "abbove", "aboove", "abve"]))), task)
+    match = nearest_query(
+        meant.replace("above", data.draw(st.sampled_from(["abov", "abbove", "aboove", "abve"]))), task
+    )
     assert str(match.query) == meant
     assert 0.8 < match.score < 1.0
 
 
-@pytest.mark.parametrize(('text', 'task', 'expected'), CASES["nearest"])
+@pytest.mark.parametrize(("text", "task", "expected"), CASES["nearest"])
 def test_free_form_conditions(text, task, expected):
     match = nearest_query(text, task)
     assert str(match.query) == expected
@@ -75,7 +77,7 @@ def test_free_form_conditions(text, task, expected):
 
 
 @pytest.mark.parametrize("by", ["edit", "embedding"])
-@pytest.mark.parametrize(('text', 'negated'), CASES["negations"])
+@pytest.mark.parametrize(("text", "negated"), CASES["negations"])
 def test_a_negation_matches_a_negation(text, negated, by):
     query = nearest_query(text, "push", by=by).query
     assert [(clause.predicate, clause.negated) for clause in query.clauses] == [("above", negated)]
@@ -104,7 +106,6 @@ def test_an_embedding_matches_the_meaning_and_a_task_s_queries_are_encoded_once(
     sizes.clear()
     assert nearest_query("gripper open", "reach", by="embedding").score == 1.0
     assert not sizes, "a query needs no text model"
-
 
 
 def test_searches_are_fast():

@@ -100,7 +100,7 @@ def logit_of(query, task="push", temperature=1.0, **at):
     return logit.item(), gradient
 
 
-@pytest.mark.parametrize(('query', 'at', 'expected'), CASES["logits"])
+@pytest.mark.parametrize(("query", "at", "expected"), CASES["logits"])
 def test_a_logit_is_the_distance_to_the_threshold_over_the_temperature(query, at, expected):
     logit, gradient = logit_of(query, **at)
     assert logit == pytest.approx(expected, rel=1e-4)
@@ -109,7 +109,7 @@ def test_a_logit_is_the_distance_to_the_threshold_over_the_temperature(query, at
     assert half == pytest.approx(expected / 2, rel=1e-4)
 
 
-@pytest.mark.parametrize(('query', 'at', 'reached'), CASES["gradients"])
+@pytest.mark.parametrize(("query", "at", "reached"), CASES["gradients"])
 def test_the_gradient_is_that_of_the_comparison_that_decides(query, at, reached):
     _, gradient = logit_of(query, **at)
     assert gradient.nonzero().flatten().tolist() == reached
