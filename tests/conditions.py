@@ -40,18 +40,19 @@ def interpret(tree, truth):
     return result
 
 
+def build(tree, leaf=str):
+    """Build the expression of a tree, given a function from the texts of leaves to expressions."""
+    if isinstance(tree, str):
+        return leaf(tree)
+    operator, parts = tree
+    if operator == "not":
+        return negate(build(parts, leaf))
+    return (all_of if operator == "all" else any_of)([build(part, leaf) for part in parts])
+
+
 def query_of(tree, task):
     """Build the query of a tree whose leaves are texts of clauses."""
-
-    def build(tree):
-        if isinstance(tree, str):
-            return parse_query(tree, task).expression
-        operator, parts = tree
-        if operator == "not":
-            return negate(build(parts))
-        return (all_of if operator == "all" else any_of)([build(part) for part in parts])
-
-    return Query(build(tree))
+    return Query(build(tree, lambda text: parse_query(text, task).expression))
 
 
 def tower(task, levels=30, width=64):

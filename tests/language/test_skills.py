@@ -65,7 +65,7 @@ PUSH = '["push it"]\ntarget = "puck"\n'
         (PUSH + "griper = 1.0", "did you mean 'gripper'"),
         (PUSH + "gripper = 2.0", "'push it': gripper .* 2.0"),
         (PUSH + "for = 3", "'push it': 'for'"),
-        ('["push it".for.pusch]\ntarget = "puck"\n', "did you mean 'push'"),
+        (PUSH + 'for.pusch.target = "puck"', "did you mean 'push'"),
         ('"push it" = 3\n', "'push it': .*table, got 3"),
         ('["push it"]\ntarget = 3\n', "'push it': target"),
         *((PUSH + f"offset = {wrong}", "'push it': offset") for wrong in ("[0, 1]", "[0, 0, inf]", "3")),

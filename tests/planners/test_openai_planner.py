@@ -8,6 +8,7 @@ import traceback
 from threading import Barrier
 
 import pytest
+from cases import read_cases
 from fake_server import PLANS, Failure, FakeServer, asked_for, completion, error, shipped
 
 import lw_torchrl as lw
@@ -85,16 +86,12 @@ def test_a_damaged_cached_answer_is_requested_again(ask, tmp_path, content):
 
 
 FAILURES = {
-    "429": (error(429, "slow down"), "too many requests, asked 2 times"),
+    cause: (error(status, message), cause) for status, message, cause in read_cases("planners/replies.toml")["http"]
+}
+FAILURES |= {
     "429 for long": (error(429, "no", **{"retry-after-ms": "9e9"}), "too many requests, asked 1 time"),
-    "500": (error(500, "my fault"), "server failed, asked 2 times .*my fault"),
     "500, without a message": (Failure(500, "<p>oops</p>", {"retry-after-ms": "1"}), "failed.*oops"),
-    "429 in 200": (Failure(200, {"error": {"message": "slow down", "code": 429}}), "too many requests"),
-    "401": (error(401, "no"), "key in OPENAI_API_KEY"),
-    "404": (error(404, "no model a/model"), "no such model .*/v1/models"),
-    "400": (error(400, "unknown field"), "rejects the request .*unknown field"),
     "400, plain": (Failure(400, "no top_k"), "rejects the request .*no top_k"),
-    "context": (error(400, "maximum context length is 2048"), "exceeds the model.s context .*max_tokens"),
     "cut body": (Failure(200, completion("x" * 99), cut=True), "was interrupted, asked 2"),
     "cut JSON": (Failure(200, '{"choices": ['), "cut off or is not JSON"),
     "HTML": (Failure(200, "<style>a{}</style><body>Welcome</body>"), "not a chat completion: Welcome"),
