@@ -137,7 +137,7 @@ word_salad = st.lists(st.sampled_from(VOCABULARY), max_size=25).map(" ".join)
 @settings(max_examples=120, deadline=None)
 @given(any_text | word_salad, tasks)
 def test_any_text_is_a_query_or_a_query_error(text, task):
-    if (query := read_query(text, task)) is not None:
+    if (query := read_query(text, TASKS[task])) is not None:
         assert parse_query(str(query), task) == parse_query(text, task) == query
         return
     with pytest.raises(QueryError) as caught:
