@@ -3,7 +3,7 @@
 from hypothesis import strategies as st
 
 from lw_torchrl.language.expressions import Once, all_of, any_of, fold, negate
-from lw_torchrl.language.queries import Query, parse_query
+from lw_torchrl.language.queries import Query, parse_query, supported_queries
 
 
 def trees(leaves, most=12):
@@ -40,18 +40,28 @@ def interpret(tree, truth):
     return result
 
 
+def build(tree, leaf=str):
+    """Build the expression of a tree, given a function from the texts of leaves to expressions."""
+    if isinstance(tree, str):
+        return leaf(tree)
+    operator, parts = tree
+    if operator == "not":
+        return negate(build(parts, leaf))
+    return (all_of if operator == "all" else any_of)([build(part, leaf) for part in parts])
+
+
 def query_of(tree, task):
     """Build the query of a tree whose leaves are texts of clauses."""
+    return Query(build(tree, lambda text: parse_query(text, task).expression))
 
-    def build(tree):
-        if isinstance(tree, str):
-            return parse_query(tree, task).expression
-        operator, parts = tree
-        if operator == "not":
-            return negate(build(parts))
-        return (all_of if operator == "all" else any_of)([build(part) for part in parts])
 
-    return Query(build(tree))
+def tower(task, levels=30, width=64):
+    """Return an expression with ``width`` alternatives at each level, whose text has exponential length."""
+    clauses = [parse_query(text, task).expression for text in supported_queries(task)[: 2 * width : 2]]
+    tip = clauses[0]
+    for _ in range(levels):
+        tip = negate(all_of([any_of([tip, clause]) for clause in clauses]))
+    return tip
 
 
 def text_of(tree):

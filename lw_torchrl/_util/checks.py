@@ -187,6 +187,16 @@ def check_choice(argument: str, value: Any, allowed: Iterable[str]) -> Any:
     return value
 
 
+def check_keys(argument: str, row: Any, allowed: Iterable[str], required: Iterable[str] = ()) -> None:
+    """Raise a :class:`ValueError` unless ``row`` is a mapping with all ``required`` keys and only ``allowed`` keys."""
+    if not isinstance(row, Mapping):
+        raise ValueError(f"{argument} must be a table, got {shown(row)}")
+    for key in row:
+        check_choice("key", key, allowed)
+    if missing := [key for key in required if key not in row]:
+        raise ValueError(f"{' and '.join(missing)} of {argument} missing, got {shown(dict(row))}")
+
+
 def unknown_name(argument: str, value: object, allowed: Iterable[str]) -> ValueError:
     """Return the error for a name that is not in ``allowed``; the message suggests names with a similar spelling."""
     names = list(allowed)

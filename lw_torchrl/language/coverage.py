@@ -44,7 +44,7 @@ def _has_sides(roles: Sequence[StepRole]) -> bool:
 
 
 def coverage_of(task: Task, steps: Sequence[PlanStep]) -> float:
-    """Return the fraction of typical states in which the plan's active steps are right for the plan's motion."""
+    """Return the fraction of typical states in which at least one step is active, and all are right for the motion."""
     roles = [role_of(step) for step in steps]
     motion = motion_of(roles)
     if motion is None:
@@ -53,7 +53,11 @@ def coverage_of(task: Task, steps: Sequence[PlanStep]) -> float:
     if motion.manner == "reach" or _has_sides(roles):
         return 1.0
     manner = "pull" if motion.verb == "pull" else motion.manner
-    return _coverage(task, touched_point(task, roles), manner, [(step.condition, role_of(step).verb) for step in steps])
+    pairs = [(step.condition, role_of(step).verb) for step in steps]
+    good = [
+        bool(active) and active <= right for active, right in _active(task, touched_point(task, roles), manner, pairs)
+    ]
+    return sum(good) / len(good)
 
 
 # The typical states are synthetic: objects and goal at fixed positions, and the hand at offsets from the touched point.
@@ -69,12 +73,6 @@ _TYPICAL = {
 # Gripper openings and hand positions relative to the touched point (metres), some at the relations' thresholds.
 _PLANE = ((0.0, 0.0), (0.035, 0.01), (-0.01, -0.035), (-0.05, 0.02), (0.02, 0.07), (0.13, -0.1))
 _AROUND = _PLANE, (-0.01, 0.01, 0.034, 0.08), (1.0, 0.8, 0.3)
-
-
-def _coverage(task: Task, point: str, motion: str, steps: Sequence[tuple[Query, Verb]]) -> float:
-    """Return the fraction of typical states in which at least one step is active and every active step is right."""
-    good = [bool(active) and active <= right for active, right in _active(task, point, motion, steps)]
-    return sum(good) / len(good)
 
 
 def _active(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from threading import Lock
 from typing import Any, Literal, NamedTuple, TypeVar
 from weakref import WeakValueDictionary
@@ -226,23 +226,25 @@ def evaluate(expression: Expression, truth: Mapping[Any, bool]) -> bool:
     return fold(expression, visit)
 
 
-def replace_leaves(expression: Expression, function: Callable[[Any], Any]) -> Expression:
-    """Replace each leaf with ``function(leaf)``, an expression or a leaf; the function is called once for each leaf.
-
-    In a latch, the leaves of the condition are replaced.
-    """
-    replaced: dict[Any, Expression] = {}
+def map_leaves(expression: Expression, function: Callable[[Any], Any]) -> Expression:
+    """Replace each leaf and each latch with ``function(leaf)``, an expression or a leaf."""
 
     def visit(each: Expression, parts: list[Expression]) -> Expression:
         if each.kind == "leaf":
-            leaf = each.leaf
-            if leaf not in replaced:
-                is_latch = isinstance(leaf, Once)
-                replaced[leaf] = once(fold(leaf.condition, visit)) if is_latch else as_expression(function(leaf))
-            return negate(replaced[leaf]) if each.negated else replaced[leaf]
+            return negate(function(each.leaf)) if each.negated else as_expression(function(each.leaf))
         return all_of(parts) if each.kind == "all" else any_of(parts)
 
     return fold(expression, visit)
+
+
+def replace_leaves(expression: Expression, function: Callable[[Any], Any]) -> Expression:
+    """Replace each leaf as :func:`map_leaves` does; in a latch, replace the leaves of the condition."""
+
+    @cache  # a latch may be mentioned by several others
+    def replaced(leaf: Any) -> Any:
+        return once(map_leaves(leaf.condition, replaced)) if isinstance(leaf, Once) else function(leaf)
+
+    return map_leaves(expression, replaced)
 
 
 def literals(expression: Expression) -> tuple[Expression, ...]:

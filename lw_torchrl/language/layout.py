@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, Literal
 
-from lw_torchrl._util.checks import Count, Natural, Positive, shown, typed_fields
+from lw_torchrl._util.checks import Count, Natural, Positive, check_keys, typed_fields
 from lw_torchrl._util.registry import ReadOnlyDict
 
 
@@ -74,11 +74,11 @@ class Layout:
         used = [number for part in present for number in places(part)]
         if twice := sorted(number for number in used if used.count(number) > 1):
             raise ValueError(f"{layout} uses index {twice[0]} of the observation more than once")
-        for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):
-            if index is not None and index + width > self.action_size:
-                raise ValueError(f"{name} of {layout} must be within {self.action_size} action numbers, got {index}")
-        if self.displacement is not None and self.gripper in range(self.displacement, self.displacement + 3):
-            raise ValueError(f"gripper of {layout} must not be an index of the displacement, got {self.gripper}")
+        moved = () if self.displacement is None else places(self.displaced(layout))
+        acting = (*moved, *places(self.effort))
+        if len({*acting}) < len(acting) or max(acting, default=0) >= self.action_size:
+            parts = f"displacement {self.displacement} and gripper {self.gripper} of {layout}"
+            raise ValueError(f"{parts} must be different indices of {self.action_size} action numbers")
         object.__setattr__(self, "thresholds", ReadOnlyDict(dict(self.thresholds)))
         for name in ("present", "positions", "all_positions", "parts"):
             getattr(self, name)  # computed eagerly, since torch.compile cannot trace the lock of a cached_property
@@ -112,11 +112,9 @@ class Layout:
         return slice(0, 0) if self.gripper is None else slice(self.gripper, self.gripper + 1)
 
     def displaced(self, user: str) -> slice:
-        """Return the slice of an action with the hand's displacement; without one, raise a ValueError that names
-        ``user``."""
+        """Return the slice of an action with the hand's displacement; raise a ValueError for ``user`` without one."""
         if self.displacement is None:
-            needed = "actions must have a displacement of the hand"
-            raise ValueError(f"{user}: {needed}, got layout {self.name!r}")
+            raise ValueError(f"{user}: actions must have a displacement of the hand, got layout {self.name!r}")
         return slice(self.displacement, self.displacement + 3)
 
     def a_step_before(self, part: slice) -> slice:
@@ -139,8 +137,7 @@ class Layout:
     def from_json(cls, row: Any) -> Layout:
         """Rebuild the layout from :meth:`to_json`; raise a ValueError if ``row`` is not such JSON."""
         names = [each.name for each in fields(cls)]
-        if not isinstance(row, Mapping) or set(row) != set(names):
-            raise ValueError(f"layout must have exactly the keys {', '.join(names)}, got {shown(row)}")
+        check_keys("layout", row, names, names)
         try:
             return cls(**{**row, "things": tuple(Slot(*pair) for pair in row["things"])})
         except TypeError as error:

@@ -17,14 +17,7 @@ from lw_torchrl.language.expressions import Expression
 from lw_torchrl.language.mentions import mentions
 from lw_torchrl.language.objects import GRIPPER, WORDS
 from lw_torchrl.language.polarity import affirmed, agree, instruction, plain_negations, poles, rests, source_of
-from lw_torchrl.language.queries import (
-    Clause,
-    Query,
-    QueryError,
-    base_clauses,
-    read_query,
-    split_words,
-)
+from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, read_query, split_words
 from lw_torchrl.language.relations import PREDICATES, RELATIONS, STATES, TOUCHING
 from lw_torchrl.language.roles import has_certain_target
 from lw_torchrl.language.skills import ScriptedSkill, SkillError, Skills, load_skills, skills_for

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
-from lw_torchrl._util.checks import Finite, Natural, check_choice, shown, typed_fields
+from lw_torchrl._util.checks import Finite, Natural, check_choice, check_keys, shown, typed_fields
 from lw_torchrl._util.files import read_toml
 from lw_torchrl.language.connectives import CONNECTIVES
 from lw_torchrl.language.layout import METAWORLD, Layout, places
@@ -69,25 +69,21 @@ def _read_coordinate(value: Any) -> Coordinate:
 
 def _read_position(value: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
     """Parse a position from tasks.toml, such as "obs[4:7]" or [0.1, "obs[37]", 0.0]."""
-    if isinstance(value, str) and (match := _SLICE.fullmatch(value)):
-        start, stop = map(int, match.groups())
-        if stop - start == 3:
-            return (start, start + 1, start + 2)
-    if isinstance(value, list) and len(value) == 3:
-        x, y, z = map(_read_coordinate, value)
-        return (x, y, z)
-    raise ValueError(f"position must have a form like 'obs[4:7]' or [0.1, 'obs[37]', 0.0], got {shown(value)}")
+    match = _SLICE.fullmatch(value) if isinstance(value, str) else None
+    position = [*range(int(match[1]), int(match[2]))] if match else value
+    if not isinstance(position, list) or len(position) != 3:
+        raise ValueError(f"position must have a form like 'obs[4:7]' or [0.1, 'obs[37]', 0.0], got {shown(value)}")
+    x, y, z = position if match else map(_read_coordinate, position)
+    return (x, y, z)
 
 
 def _read_object(name: str, row: Any) -> NamedObject:
     """Parse an object from tasks.toml: a position, or {position = ..., opening = "obs[92]"}."""
     if not isinstance(row, Mapping):
         return NamedObject(name, _read_position(row))
-    for key in row:
-        check_choice("key", key, ("position", "opening"))
-    opening = row.get("opening")
-    if "position" not in row or not isinstance(opening, str) or not (match := _INDEX.fullmatch(opening)):
-        raise ValueError(f"must have a position and an opening like 'obs[92]', got {shown(row)}")
+    check_keys("the object", row, ("position", "opening"), ("position", "opening"))
+    if (match := _INDEX.fullmatch(str(row["opening"]))) is None:
+        raise ValueError(f"opening must have a form like 'obs[92]', got {shown(row['opening'])}")
     return NamedObject(name, _read_position(row["position"]), opening=int(match[1]))
 
 
@@ -95,12 +91,9 @@ def _read_point(name: str, row: Any, objects: Mapping[str, NamedObject]) -> Name
     """Parse a point of tasks.toml: a position, or {object = ..., offset = [x, y, z]}."""
     if not isinstance(row, Mapping):
         return NamedObject(name, _read_position(row), ours=True)
-    for key in row:
-        check_choice("key", key, ("object", "offset"))
-    if len(row) != 2 or not isinstance(row["offset"], list):
-        raise ValueError(f"must have an object and an offset = [x, y, z], got {shown(row)}")
-    owner = objects[check_choice("object", row["object"], [*objects])]
-    return NamedObject(name, owner.position, tuple(row["offset"]), ours=True)
+    check_keys("the point", row, ("object", "offset"), ("object", "offset"))
+    owner, offset = objects[check_choice("object", row["object"], [*objects])], row["offset"]
+    return NamedObject(name, owner.position, tuple(offset) if isinstance(offset, list) else offset, ours=True)
 
 
 def read_objects(row: Mapping[str, Any], layout: Layout = METAWORLD) -> tuple[NamedObject, ...]:

@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._util.checks import shown, typed, typed_fields
+from lw_torchrl._util.checks import check_value, shown, typed, typed_fields
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import comparisons
@@ -319,8 +319,7 @@ class Plans(Mapping[str, ConditionalPlan]):
     def require(self, tasks: Iterable[str]) -> None:
         """Raise a PlanError if a task in ``tasks`` has no plan in this collection."""
         if missing := [task for task in tasks if task not in self]:
-            what = f"plans have no plan for {', '.join(missing)}; they cover {', '.join(self)}"
-            raise PlanError(f"{what}. Load or write a plan for each task, or leave the task out.")
+            raise PlanError(f"plans have no plan for {', '.join(missing)}; they cover {', '.join(self)}")
 
 
 AnyPlans = Plans | Mapping[str, ConditionalPlan] | Sequence[ConditionalPlan]
@@ -331,8 +330,7 @@ def as_plans(plans: AnyPlans, argument: str = "plans") -> Plans:
     """Convert a mapping or a list of plans to :class:`Plans`; return Plans unchanged. Errors name the ``argument``."""
     if isinstance(plans, Plans):
         return plans
-    if not isinstance(plans, Mapping | list | tuple):
-        raise TypeError(f"{argument} must map task names to ConditionalPlan, got {type(plans).__name__}")
+    check_value(argument, plans, Mapping | list | tuple)
     try:
         return Plans(plans)
     except (TypeError, PlanError) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import permutations
@@ -19,14 +20,13 @@ from lw_torchrl.language.expressions import (
     Expression,
     Once,
     all_of,
-    any_of,
     as_expression,
     count_mentions,
-    fold,
     has_latch,
     implied,
     leaves,
     literals,
+    map_leaves,
     negate,
     once,
     replace_leaves,
@@ -37,9 +37,7 @@ from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, STATES, TOUCHING, UNARY
 from lw_torchrl.language.tasks import Task, get_task
 
-_BEGINNINGS = {"is", "are", "isn't", "aren't", "not"} | {
-    predicate.split()[0] for predicate in PREDICATES
-}  # of predicates
+_BEGINNINGS = {"is", "are", "isn't", "aren't", "not", *(name.split()[0] for name in PREDICATES)}  # of predicates
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
 _OTHERS = frozenset(("(", *CONNECTIVES)) - {"and"}
@@ -105,9 +103,8 @@ class Query:
         """True for a clause or a conjunction of clauses: a query without "or" and without latches."""
         if self._given:
             return True
-        if self.has_latch:
-            return False
-        return self.expression.kind != "any" and all(part.kind == "leaf" for part in self.expression.parts)
+        parts = self.expression.parts
+        return self.expression.kind != "any" and not self.has_latch and all(part.kind == "leaf" for part in parts)
 
     @cached_property
     def has_latch(self) -> bool:
@@ -136,14 +133,7 @@ def _without_negation(clause: Clause) -> Expression:
 
 
 def _present(expression: Expression) -> Expression:
-    def visit(each: Expression, parts: list[Expression]) -> Expression:
-        if each.kind != "leaf":
-            return all_of(parts) if each.kind == "all" else any_of(parts)
-        if not isinstance(each.leaf, Once):
-            return each
-        return negate(_present(each.leaf.condition)) if each.negated else _present(each.leaf.condition)
-
-    return fold(expression, visit)
+    return map_leaves(expression, lambda leaf: _present(leaf.condition) if isinstance(leaf, Once) else leaf)
 
 
 def _write_literal(leaf: Clause | Once, negated: bool) -> str:
@@ -360,10 +350,9 @@ def parse_query(text: str, task: str | Task) -> Query:
 
 def read_query(text: str, task: Task) -> Query | None:
     """Parse a condition like :func:`parse_query`, but return None (quickly) if the text is not a query."""
-    try:
+    with suppress(QueryError):
         return _parse(text, task, explain=False)
-    except QueryError:
-        return None
+    return None
 
 
 def _parse(text: str, task: Task, explain: bool) -> Query:

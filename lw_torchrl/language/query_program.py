@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from numbers import Real
 from typing import Literal
@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import check_choice, check_value, shown
+from lw_torchrl._util.checks import check_choice, check_value
 from lw_torchrl._util.devices import check_finite
 from lw_torchrl.language.gates import Gates, Truth, evaluate_gates
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.query_tables import QueryTables, compile_facts, compile_queries, unroll
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
-from lw_torchrl.language.tasks import TASKS, Task, one_layout, task_ids
+from lw_torchrl.language.tasks import Task, lists_by_task, one_layout, task_ids
 
 _LEAST, _MOST = 1e-6, 1e4  # bounds on the magnitude of a logit, and on differentiated lengths (metres)
 _NO_LATCHES = np.empty((0, 0), dtype=bool)
@@ -60,17 +60,10 @@ class QueryProgram(nn.Module):
     """
 
     def __init__(self, queries: Mapping[str | Task, Sequence[str | Query]]) -> None:
-        if not check_value("queries", queries, Mapping):
-            raise ValueError("queries must contain at least one task, got an empty mapping")
-        compiled: dict[Task, tuple[Query, ...]] = {}
-        for key, listed in queries.items():
-            task = key if isinstance(key, Task) else TASKS[check_choice("queries", key, TASKS)]
-            if any(task.name == other.name for other in compiled):
-                raise ValueError(f"queries must contain each task once, got {task.name!r} twice")
-            if isinstance(listed, (str, Query)) or not isinstance(listed, Iterable) or not listed:
-                raise ValueError(f"queries[{task.name!r}] must be a list of at least one query, got {shown(listed)}")
-            where = f"queries[{task.name!r}]"
-            compiled[task] = tuple(check_query(check_value(where, query, str | Query), task) for query in listed)
+        compiled = {
+            task: tuple(check_query(check_value(f"queries[{task.name!r}]", each, str | Query), task) for each in listed)
+            for task, listed in lists_by_task("queries", queries).items()
+        }
         super().__init__()
         self.layout = one_layout(compiled)
         self.queries = dict(sorted(((task.name, parsed) for task, parsed in compiled.items())))
@@ -133,8 +126,21 @@ class QueryProgram(nn.Module):
 
     def _columns_of(self, observation: Tensor, task_id: Tensor, latches: Tensor | None) -> Tensor:
         """Return the truth (..., S + L) bool of the queries and latches."""
-        _check_batch(observation, task_id, self.layout.size)
-        self._check_latches(task_id, latches)
+        for name, value in (("observation", observation), ("task_id", task_id)):
+            if not isinstance(value, Tensor):
+                raise TypeError(f"{name} must be a tensor, got {type(value).__name__}; convert it with torch.as_tensor")
+        shape, ids, size = tuple(observation.shape), tuple(task_id.shape), self.layout.size
+        if shape[-1:] != (size,) or not observation.is_floating_point():
+            raise ValueError(f"observation must be float (..., {size}), got {observation.dtype} of shape {shape}")
+        if ids != shape[:-1] or task_id.dtype not in (torch.int64, torch.int32):
+            raise ValueError(f"task_id must be int64 of shape {shape[:-1]}, got {task_id.dtype} of shape {ids}")
+        needed = (*ids, self.num_latches)
+        if latches is None and self.num_latches:
+            raise ValueError(
+                f"the queries depend on earlier steps of the episode: pass latches, bool of shape {needed}"
+            )
+        if latches is not None and self.num_latches and (latches.shape != needed or latches.dtype != torch.bool):
+            raise ValueError(f"latches must be bool of shape {needed}, got {latches.dtype} of {tuple(latches.shape)}")
         if (kernel := self._kernel(observation, task_id, latches)) is not None:
             return self._answer(kernel, observation, task_id, latches)
         check_finite("observation", observation)
@@ -143,19 +149,6 @@ class QueryProgram(nn.Module):
         if latches is not None and self.num_latches:
             atoms = torch.cat((atoms, latches.reshape(-1, self.num_latches)), 1)
         return self._combine(atoms, tables, "exact").reshape(*task_id.shape, self._columns)
-
-    def _check_latches(self, task_id: Tensor, latches: Tensor | None) -> None:
-        if not self.num_latches:
-            return
-        shape = (*task_id.shape, self.num_latches)
-        if latches is None:
-            raise ValueError(
-                "the queries depend on earlier steps of the episode ('has been', 'once (...)'), which one observation "
-                f"does not show: pass latches, bool of shape {shape}, from QAFTransform or from remember()"
-            )
-        if latches.shape != shape or latches.dtype != torch.bool:
-            got = f"got {latches.dtype} of shape {tuple(latches.shape)}"
-            raise ValueError(f"latches must be bool of shape {shape}, {got}")
 
     def logits(
         self,
@@ -249,14 +242,3 @@ class QueryProgram(nn.Module):
         if self._any_far:
             length = torch.where(tables.far, -length, length)
         return torch.where(tables.length, length, x + y + z)
-
-
-def _check_batch(observation: Tensor, task_id: Tensor, size: int) -> None:
-    for name, value in (("observation", observation), ("task_id", task_id)):
-        if not isinstance(value, Tensor):
-            raise TypeError(f"{name} must be a tensor, got {type(value).__name__}; convert it with torch.as_tensor")
-    shape, ids = tuple(observation.shape), tuple(task_id.shape)
-    if shape[-1:] != (size,) or not observation.is_floating_point():
-        raise ValueError(f"observation must be float of shape (..., {size}), got {observation.dtype} of shape {shape}")
-    if ids != shape[:-1] or task_id.dtype not in (torch.int64, torch.int32):
-        raise ValueError(f"task_id must be int64 of shape {shape[:-1]}, got {task_id.dtype} of shape {ids}")

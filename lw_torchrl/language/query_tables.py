@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl.language.expressions import FALSE, Expression, Once, all_of, any_of, fold, leaves, negate
+from lw_torchrl.language.expressions import FALSE, Expression, Once, any_of, leaves, map_leaves, negate
 from lw_torchrl.language.gates import Operand, Shapes, compile_gates, inner_gates
 from lw_torchrl.language.objects import TypedPosition, coordinate_indices, typed_position
 from lw_torchrl.language.queries import Clause, Query
@@ -97,17 +97,13 @@ def unroll(queries: Iterable[Query]) -> tuple[list[Expression], list[Expression]
     """
     latches: dict[Once, Expression] = {}
 
-    def visit(each: Expression, parts: list[Expression]) -> Expression:
-        if each.kind != "leaf":
-            return all_of(parts) if each.kind == "all" else any_of(parts)
-        if not isinstance(each.leaf, Once):
-            return each
-        if each.leaf not in latches:
-            now = fold(each.leaf.condition, visit)
-            latches[each.leaf] = any_of([Before(len(latches)), now])
-        return negate(latches[each.leaf]) if each.negated else latches[each.leaf]
+    def unrolled(leaf: Any) -> Any:
+        if isinstance(leaf, Once) and leaf not in latches:
+            now = map_leaves(leaf.condition, unrolled)
+            latches[leaf] = any_of([Before(len(latches)), now])
+        return latches.get(leaf, leaf)
 
-    return [fold(query.expression, visit) for query in queries], list(latches.values())
+    return [map_leaves(query.expression, unrolled) for query in queries], list(latches.values())
 
 
 def _columns(queries: Mapping[Task, Sequence[Query]]) -> tuple[list[list[Expression]], int]:

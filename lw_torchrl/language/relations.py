@@ -7,6 +7,7 @@ import re
 from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.resources import files
 from typing import Any, Literal
 
@@ -50,24 +51,18 @@ def _check_predicate(name: str, parts: Any, others: Iterable[str]) -> tuple[Comp
     """Check a predicate's comparisons and return them; raise a ValueError if a query cannot contain the name."""
     if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z'-]*( [a-z'-]+)*", name):
         raise ValueError(f"name of a predicate must be lower-case words like 'left of', got {shown(name)}")
-    first, *_ = words = name.split()
-    reserved = [name] * (name in others) + [first] * (first in ("is", "isn't", "not"))
-    if reserved := reserved + [word for word in words if word in (*CONNECTIVES, "the", "a", "an")]:
-        raise ValueError(f"name {name!r} must not contain {reserved[0]!r}, which is reserved in queries")
+    is_beginning = name.split()[0] in ("is", "isn't", "not")
+    if name in others or is_beginning or not {*name.split()}.isdisjoint((*CONNECTIVES, "the", "a", "an")):
+        raise ValueError(f"name {name!r} must not be or contain words that are reserved in queries, such as 'and'")
     if not isinstance(parts, (tuple, list)) or not parts or not all(isinstance(part, Comparison) for part in parts):
         raise ValueError(f"{name!r} must be a tuple of at least one Comparison, got {shown(parts)}")
     return tuple(parts)
 
 
-def _check_relation(name: str, parts: Any) -> tuple[Comparison, ...]:
-    return _check_predicate(name, parts, UNARY)
-
-
 def _check_state(name: str, parts: Any) -> tuple[Comparison, ...]:
-    for part in _check_predicate(name, parts, {*_OF_POSITION, *PREDICATES.maps[-1]}):
-        if (part.axes, part.length) != ("z", False):
-            needed = "compare the opening, Comparison('z', ..., length=False)"
-            raise ValueError(f"state {name!r} must {needed}, got {shown(part)}")
+    _check_predicate(name, parts, {*_OF_POSITION, *PREDICATES.maps[-1]})
+    if any((part.axes, part.length) != ("z", False) for part in parts):
+        raise ValueError(f"state {name!r} must compare the opening, Comparison('z', ..., length=False), got {parts}")
     return tuple(parts)
 
 
@@ -80,6 +75,7 @@ Add a state with ``STATES["on"] = STATES["open"]``.
 """
 UNARY = ChainMap[str, tuple[Comparison, ...]](STATES, _OF_POSITION)  # type: ignore[arg-type]
 """Predicates of a single object: "touching the table" (based on the object's z) and the states of its opening."""
+_check_relation = partial(_check_predicate, others=UNARY)
 RELATIONS = Registry("relation", "lw_torchrl.relations", _predicates("relations"), _check_relation)
 """The relations between two objects: the paper's 13 relations, and those that you add (see docs/custom-networks.md).
 

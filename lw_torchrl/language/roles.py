@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 
 from rapidfuzz.distance import OSA
 
-from lw_torchrl._util.checks import Probability, shown, typed_fields
+from lw_torchrl._util.checks import Probability, check_keys, typed_fields
 from lw_torchrl.language.objects import GOAL, GRIPPER, WORDS
 from lw_torchrl.language.polarity import MOTIONS, command_form, instruction
 from lw_torchrl.language.tasks import TASKS, Task, whole_objects
@@ -150,17 +150,11 @@ def ignored_words(skill: str, task: Task) -> str:
     """
     text, aside, _ = instruction(skill)
     marked = mark_objects(text, task)
-    ignored = _unused(marked, task)
-    ignored += _BESIDE.findall(marked)
+    runs = groupby(_tokens(marked), lambda word: _is_used(word, task))
+    ignored = [" ".join(run) for is_used, run in runs if not is_used] + _BESIDE.findall(marked)
     if (later := _LATER.search(text)) and (later[2] in MOTIONS or command_form(later[2])):
         ignored.append(later[1])
     return "; ".join([*ignored, *([aside] if aside else [])])
-
-
-def _unused(marked: str, task: Task) -> list[str]:
-    """Return the words that the parser of steps does not use, in a text with marked objects."""
-    runs = groupby(_tokens(marked), lambda word: _is_used(word, task))
-    return [" ".join(run) for is_used, run in runs if not is_used]
 
 
 def _tokens(marked: str) -> list[str]:
@@ -258,12 +252,8 @@ class StepRole:
     def from_json(cls, row: Any) -> StepRole:
         """Rebuild a role from :meth:`to_json`; raise a ValueError if ``row`` is not such JSON."""
         names = [each.name for each in fields(cls)]
-        if not isinstance(row, dict) or set(row) - {*names} or not {*names[:4]} <= set(row):
-            raise ValueError(f"role must be an object with the keys {', '.join(names)}, got {shown(row)}")
-        try:
-            return cls(**row)
-        except TypeError as error:
-            raise ValueError(f"role: {error}") from error
+        check_keys("role", row, names, names[:4])
+        return cls(**row)
 
 
 def motion_of(roles: Sequence[StepRole]) -> StepRole | None:

@@ -10,7 +10,7 @@ from lw_torchrl._util.checks import check_choice
 from lw_torchrl.language.objects import coordinate_indices
 from lw_torchrl.language.skills import ScriptedSkill, Skills, load_skills
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
-from lw_torchrl.language.tasks import Task, get_task, one_layout, task_ids
+from lw_torchrl.language.tasks import Task, lists_by_task, one_layout, task_ids
 
 
 class _Tables(NamedTuple):
@@ -42,17 +42,12 @@ class SkillProgram(nn.Module):
 
     def __init__(self, skills: Mapping[str | Task, Sequence[str | ScriptedSkill]], table: Skills | None = None) -> None:
         known = load_skills() if table is None else table
-        if not skills:
-            raise ValueError("skills must contain at least one task, got an empty mapping")
-        compiled: dict[Task, list[ScriptedSkill]] = {}
-        for name, listed in skills.items():
-            task = get_task(name)
-            if isinstance(listed, (str, ScriptedSkill)) or not listed:
-                raise ValueError(f"skills[{task.name!r}] must be a list of at least one skill, got {listed!r}")
-            compiled[task] = [
-                (known[check_choice("skill", skill, known)] if isinstance(skill, str) else skill).for_task(task)
-                for skill in listed
-            ]
+
+        def skill_of(skill: str | ScriptedSkill) -> ScriptedSkill:
+            return known[check_choice("skill", skill, known)] if isinstance(skill, str) else skill
+
+        lists = lists_by_task("skills", skills)
+        compiled = {task: [skill_of(skill).for_task(task) for skill in listed] for task, listed in lists.items()}
         super().__init__()
         self.layout = layout = one_layout(compiled)
         self._displaced = layout.displaced("scripted skills")

@@ -11,7 +11,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from lw_torchrl._util.checks import Finite, Scale, check_choice, did_you_mean, shown, typed, typed_fields
+from lw_torchrl._util.checks import Finite, Scale, check_keys, did_you_mean, shown, typed, typed_fields
 from lw_torchrl._util.files import AnyPath, read_toml
 from lw_torchrl._util.registry import ReadOnlyDict
 from lw_torchrl.language.objects import GRIPPER, WORDS
@@ -72,17 +72,12 @@ _KEYS = tuple(f.name for f in fields(ScriptedSkill) if f.name not in ("text", "v
 
 
 def _skill(text: str, row: Any, tasks: Tasks) -> ScriptedSkill:
-    if not isinstance(row, Mapping):
-        raise SkillError(f"the skill must be a table, got {shown(row)}")
+    check_keys("the skill", row, (*_KEYS, "for"), ["target"])
     values = dict(row)
     changes = values.pop("for", {})
     if not isinstance(changes, Mapping) or not all(isinstance(change, Mapping) for change in changes.values()):
         raise SkillError(f"'for' must map task names to tables, got {shown(changes)}")
     variants = {check_task(task, tasks): _skill(text, {**values, **change}, tasks) for task, change in changes.items()}
-    for key in values:
-        check_choice("key", key, _KEYS)
-    if "target" not in values:
-        raise SkillError("target is missing")
     gain = values.get("gain", 10.0)
     values["gain"] = (gain,) * 3 if isinstance(gain, (int, float)) else gain
     values |= {key: tuple(values[key]) for key in ("gain", "offset") if isinstance(values.get(key), list)}

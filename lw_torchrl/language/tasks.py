@@ -12,7 +12,16 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._util.checks import check_choice, did_you_mean, shown, typed, typed_fields, unknown_name
+from lw_torchrl._util.checks import (
+    check_choice,
+    check_keys,
+    check_value,
+    did_you_mean,
+    shown,
+    typed,
+    typed_fields,
+    unknown_name,
+)
 from lw_torchrl._util.files import AnyPath, read_toml
 from lw_torchrl._util.registry import ReadOnlyDict
 from lw_torchrl.language.layout import METAWORLD, Layout, places
@@ -47,15 +56,15 @@ class Task:
     def __post_init__(self) -> None:
         _check_name(self.name)
         what, size = f"objects of task {self.name!r}", self.layout.size
-        if len(self.objects) > _MOST_OBJECTS:
-            raise ValueError(f"{what} must be at most {_MOST_OBJECTS}, including the gripper, got {len(self.objects)}")
         for named in self.objects:
             for index in (*named.position, named.opening):
                 if isinstance(index, int) and not 0 <= index < size:
                     raise ValueError(f"position of {named.name!r} must use obs[0] to obs[{size - 1}], got obs[{index}]")
         names = [named.name for named in self.objects]
-        if names[:1] != [GRIPPER] or len({*names}) != len(names):
-            raise ValueError(f"{what} must begin with {GRIPPER!r} and have distinct names, got {names}")
+        if names[:1] != [GRIPPER] or len({*names}) != len(names) or len(names) > _MOST_OBJECTS:
+            raise ValueError(
+                f"{what} must be {GRIPPER!r} first and at most {_MOST_OBJECTS} distinct names, got {names}"
+            )
 
     @cached_property
     def object_names(self) -> tuple[str, ...]:
@@ -109,10 +118,7 @@ class Task:
         invalid.
         """
         try:
-            if not isinstance(row, Mapping):
-                raise ValueError(f"the task must be a table, got {shown(row)}")
-            for key in row:
-                check_choice("key", key, ("description", "objects", "points", "layout", "mt10"))
+            check_keys("the task", row, ("description", "objects", "points", "layout", "mt10"))
             description = row.get("description")
             if not isinstance(description, str) or not description.strip():
                 raise ValueError(f"description must be a sentence, got {shown(description)}")
@@ -246,19 +252,15 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[
         >>> resolve_tasks(["push", "door-open"])
         ('door-open', 'push')
     """
-    if not isinstance(tasks, Mapping):
-        raise TypeError(f"tasks must map names to Task, got {shown(tasks)} ({type(tasks).__name__})")
+    check_value("tasks", tasks, Mapping)
+    check_value("tasks", names, str | Iterable[str])
     if isinstance(names, str):
         if names not in tasks and names not in _SETS:
             raise _unknown_task("tasks", names, tasks)
         names = _SETS.get(names, (names,))
-    if not isinstance(names, Iterable):
-        raise TypeError(f"tasks must be 'MT10', 'MT50', a task's name or a list of names, got {shown(names)}")
     checked = [check_task(name, tasks) for name in names]
-    if not checked:
-        raise ValueError("tasks must contain at least one task, got an empty list")
-    if repeated := sorted({name for name in checked if checked.count(name) > 1}):
-        raise ValueError(f"tasks must not contain duplicates, got {', '.join(repeated)} more than once")
+    if not checked or len({*checked}) < len(checked):
+        raise ValueError(f"tasks must be at least one task, and each only once, got {shown(checked)}")
     return tuple(sorted(checked))
 
 
@@ -283,6 +285,19 @@ def named_tasks(tasks: TaskList, *, known: Tasks = TASKS) -> dict[str, Task]:
 def get_task(task: str | Task, tasks: Tasks = TASKS) -> Task:
     """Return the :class:`Task` with a given name in ``tasks``; return a Task unchanged."""
     return task if isinstance(task, Task) else tasks[check_task(task, tasks)]
+
+
+def lists_by_task(argument: str, lists: Mapping[str | Task, Any]) -> dict[Task, list[Any]]:
+    """Return lists by :class:`Task`; raise a ValueError if there is none, one is empty, or a task is there twice."""
+    check_value(argument, lists, Mapping)
+    tasks = (name if isinstance(name, Task) else TASKS[check_choice(argument, name, TASKS)] for name in lists)
+    by_task = dict(zip(tasks, lists.values(), strict=True))
+    if not by_task or len({task.name for task in by_task}) < len(lists):
+        raise ValueError(f"{argument} must contain at least one task, and each task once, got {shown(lists)}")
+    for task, listed in by_task.items():
+        if not isinstance(listed, list | tuple) or not listed:
+            raise ValueError(f"{argument}[{task.name!r}] must be a list of at least one item, got {shown(listed)}")
+    return by_task
 
 
 def one_layout(tasks: Iterable[Task]) -> Layout:

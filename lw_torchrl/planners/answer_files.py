@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -120,10 +119,10 @@ def read_reply(
     elif not reply.is_answer:
         notes.append("the answer is empty")
     elif schema and reply.finish != "length":
-        valid = False
+        value = None
         with suppress(ValueError, RecursionError):
-            valid = passes(json.loads(raw), schema)
-        notes += [] if valid else ["the answer does not follow the schema"]
+            value = json.loads(raw)
+        notes += [] if passes(value, schema) else ["the answer does not follow the schema"]
     return Answer(task.name, format, attempt, _storable(text), raw, decoded, reply.tokens, notes=(*notes, *reply.notes))
 
 
@@ -158,11 +157,9 @@ def write_answer(folder: AnyPath, model: str, answer: Answer) -> Path:
 def write_settings(folder: Path, settings: dict[str, Any]) -> None:
     """Write ``folder/settings.json``; raise a ValueError if the folder holds answers with different settings."""
     file = folder / "settings.json"
-    before = read_json(file, "out: the settings") if file.is_file() else settings
-    if before != settings:
-        difference = ", ".join(differences(before, settings))
-        advice = "use the earlier settings, or choose a new name (--name) or out folder for the new answers"
-        raise ValueError(f"out: {str(folder)!r} contains answers with different settings ({difference}); {advice}")
+    if changed := differences(read_json(file, "out: the settings") if file.is_file() else settings, settings):
+        what = f"out: {str(folder)!r} contains answers with different settings ({', '.join(changed)})"
+        raise ValueError(f"{what}; use the earlier settings, or choose a new name (--name) or out folder")
     write_json(file, settings)
 
 
@@ -171,12 +168,12 @@ def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:
     path = expanded(source)
     if not path.exists():
         raise FileNotFoundError(f"source: no file or folder {str(path)!r}")
-    answers = defaultdict[str, dict[_Place, str | Path]](dict)
+    answers: dict[str, dict[_Place, str | Path]] = {}
     for model, place, answer in _answers_in_folder(path) if path.is_dir() else _answers_in_lines(path):
-        answers[model][place] = answer
+        answers.setdefault(model, {})[place] = answer
     if not answers:
         raise ValueError(f"source: {str(path)!r} holds no answer files <model>/<format>/<task>-<attempt>.<ext>")
-    return dict(answers)
+    return answers
 
 
 def answer_text(answer: str | Path) -> str:
@@ -277,10 +274,9 @@ class FilePlanner:
     ) -> Answers:
         """Return the recorded answers for tasks; see :meth:`Planner.plans`."""
         check_choice("format", format, PLAN_FORMATS)
-        count = check_value("attempts", attempts, Count)
         answers = []
         for name, task in named_tasks(tasks).items():
-            for attempt in range(count):
+            for attempt in range(check_value("attempts", attempts, Count)):
                 if (format, name, attempt) not in self._answers:
                     recorded = [str(place[2]) for place in self.recorded if place[:2] == (format, name)]
                     what = f"no answer of {self.name!r} is recorded for {name} in {format}, attempt {attempt}"

@@ -73,8 +73,7 @@ class ChatClient:
         try:
             import openai
         except ImportError as error:
-            needs = "requests to a model need the extra [llm]: pip install 'lw_torchrl[llm]'"
-            raise ImportError(f"{needs} ({error})") from error
+            raise ImportError(f"requests to a model need an extra: pip install 'lw_torchrl[llm]' ({error})") from error
         self._openai, self.model, self.address, self._timeout = openai, model, server_address(base_url), timeout
         self._key = key = os.environ.get(_KEY, "").strip()
         if self.address == OPENAI and not key:
@@ -299,6 +298,7 @@ def _read_completion(content: bytes) -> tuple[Reply, str]:
     if len(content) > REPLY_LIMIT:
         size = f"the reply is larger than {REPLY_LIMIT // 2**20} MiB"
         raise PlannerError(f"{size}. Lower max_tokens, and remove options that lengthen replies")
+    body: Any = None
     try:
         body = json.loads(content.decode("utf-8-sig"))
         choices = [choice for choice in body["choices"] or () if choice is not None]
@@ -307,12 +307,12 @@ def _read_completion(content: bytes) -> tuple[Reply, str]:
         choice = choices[0]
         message = choice.get("message") or {}
         answer = message.get("content") or choice.get("text")
-    except (ValueError, RecursionError) as error:
-        if content.strip()[:1] in (b"", b"{"):
+    except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
+        if body is None and content.strip()[:1] in (b"", b"{"):
             raise PlannerError(f"the reply was cut off or is not JSON: {_excerpt(str(error))}. Retry") from None
-        raise _no_completion(content) from None
-    except (KeyError, TypeError, AttributeError):
-        raise _no_completion(content) from None
+        advice = "Check that base_url is the address of an OpenAI-compatible server, usually ending in /v1"
+        text = _excerpt(content.decode("utf-8", "replace"))
+        raise PlannerError(f"the reply is not a chat completion: {text}. {advice}", fatal=True) from None
     answer, refused = _join_parts(answer)
     refusal = _text(message.get("refusal")) or refused
     notes = []
@@ -320,9 +320,8 @@ def _read_completion(content: bytes) -> tuple[Reply, str]:
         others = [name for name, value in message.items() if value and name not in ("role", "refusal")]
         notes = [f"the server sent {_excerpt(name)[:40]} instead of an answer" for name in others if name != "content"]
         if "content" in others:
-            notes.append(
-                f"the server sent content without a text instead of an answer: {_excerpt(str(message['content']))}"
-            )
+            text = _excerpt(str(message["content"]))
+            notes.append(f"the server sent content without a text instead of an answer: {text}")
     usage = body.get("usage")
     counts = [usage.get(name) if isinstance(usage, dict) else 0 for name in ("prompt_tokens", "completion_tokens")]
     tokens = Tokens(*(count if type(count) is int and count >= 0 else 0 for count in counts))
@@ -330,23 +329,16 @@ def _read_completion(content: bytes) -> tuple[Reply, str]:
     return Reply(answer, finish, refusal, tokens, tuple(notes)), _excerpt(_text(body.get("model")))
 
 
-def _no_completion(content: bytes) -> PlannerError:
-    advice = "Check that base_url is the address of an OpenAI-compatible server, usually ending in /v1"
-    text = _excerpt(content.decode("utf-8", "replace"))
-    return PlannerError(f"the reply is not a chat completion: {text}. {advice}", fatal=True)
-
-
 def _join_parts(content: Any) -> tuple[str, str]:
     """Return the answer and the refusal in a message's content (a text or a list of parts), without reasoning."""
-    answer, refusal = [], []
+    answer = refusal = ""
     for part in content if isinstance(content, list) else [content]:
+        text = part
         if isinstance(part, dict) and part.get("type", "text") in ("text", "output_text", "refusal"):
             text = part.get("text")
-            answer.append(_text(text.get("value") if isinstance(text, dict) else text))
-            refusal.append(_text(part.get("refusal")))
-        else:
-            answer.append(_text(part))
-    return "".join(answer), "".join(refusal)
+            refusal += _text(part.get("refusal"))
+        answer += _text(text.get("value") if isinstance(text, dict) and text is not part else text)
+    return answer, refusal
 
 
 def _text(value: Any) -> str:

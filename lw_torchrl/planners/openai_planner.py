@@ -104,8 +104,7 @@ class OpenAIPlanner:
         except (TypeError, ValueError, RecursionError) as error:
             raise TypeError(f"options must be a mapping of JSON values, got {shown(options)}") from error
         if own := sorted(_OWN_FIELDS & set(self.options or ())):
-            others = ", ".join(sorted(_OWN_FIELDS))
-            raise ValueError(f"options must not set {', '.join(own)} (reserved: {others})")
+            raise ValueError(f"options must not set {', '.join(own)} (reserved: {', '.join(sorted(_OWN_FIELDS))})")
         self.name = folder_name(name or (f"{model}-constrained" if constrain else model))
         self.cache = Path(cache)
         self.concurrency, self.retries, self.timeout = concurrency, retries, timeout
@@ -184,10 +183,8 @@ class OpenAIPlanner:
         before, reports = list(answers), list(facts)
         formats = {answer.format for answer in before}
         if len(formats) != 1 or len(reports) != len(before):
-            what = f"{counted(len(before), 'answer')} in {', '.join(sorted(formats)) or 'no format'}"
-            raise ValueError(
-                f"answers must have one format, and facts one report per answer, got {what} and {len(reports)} reports"
-            )
+            what = f"{len(before)} answers in {', '.join(sorted(formats)) or 'no format'}, and {len(reports)} reports"
+            raise ValueError(f"answers must have one format, and facts one report per answer, got {what}")
         (format,) = formats
         questions = []
         for answer, report in zip(before, reports, strict=True):
@@ -225,9 +222,8 @@ class OpenAIPlanner:
                     write_answer(out, name, answers[-1])
                 bar.update()
         if errors:
-            others = f" {counted(len(errors) - 1, 'other request')} also failed." if len(errors) > 1 else ""
             kept = f"{len(answers)} of {counted(len(questions), 'answer')} are cached in {str(self.cache)!r}"
-            message = f"{errors[0]}{others} {kept}; repeat the call to request the missing answers."
+            message = f"{errors[0]} {kept}; repeat the call to request the missing answers."
             raise PlannerError(message, fatal=errors[0].fatal)
         return Answers(answers)
 

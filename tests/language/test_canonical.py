@@ -4,18 +4,14 @@ import inspect
 from dataclasses import replace
 
 import pytest
+from cases import read_cases
 from hypothesis import given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from benchmarks.language import as_branches
 from lw_torchrl.language import canonical, roles, step_parser
-from lw_torchrl.language.canonical import (
-    canonical_plan,
-    canonical_plans,
-    explain_canonical,
-    fallback_plan,
-)
+from lw_torchrl.language.canonical import canonical_plan, canonical_plans, explain_canonical, fallback_plan
 from lw_torchrl.language.coverage import coverage_of
 from lw_torchrl.language.objects import GOAL, GRIPPER, NamedObject
 from lw_torchrl.language.plan_files import parse_plan
@@ -24,6 +20,7 @@ from lw_torchrl.language.roles import StepRole, mark_objects, role_vectors
 from lw_torchrl.language.step_parser import parse_steps
 from lw_torchrl.language.tasks import first_object, role_object
 
+CASES = read_cases("language/steps.toml")
 OWN, MT10_SKILLS = lw.load_plans("MT50"), lw.load_plans("MT50", skills="MT10")
 G = GRIPPER
 
@@ -44,64 +41,31 @@ def without_roles(plan):
     return replace(plan, steps=tuple(replace(step, role=None) for step in plan.steps))
 
 
-@pytest.mark.parametrize(
-    ("task", "condition", "text", "verb", "moved", "target", "direction"),
-    [
-        ("push", "gripper is closed", "carry the puck over to the goal", "carry", "puck", GOAL, None),
-        ("push", "gripper is open", "nudge the puck forward", "push", G, "puck", "away"),
-        ("push", "gripper is not near the puck", "grab the puck", "descend", G, "puck", None),
-        ("push", "gripper is near the puck", "grab it", "close", G, "puck", None),
-        ("push", "gripper is near the puck", "grip a puck", "close", G, "puck", None),
-        ("push", "gripper is open", "let go of the puck with the gripper", "open", G, "puck", None),
-        ("push", "gripper is open", "position gripper over puck", "approach", G, "puck", None),
-        ("push", "gripper is open", "put the hand around the puck", "descend", G, "puck", None),
-        ("dial-turn", "gripper is open", "turn the dial", "push", G, "dial", "goal"),
-        ("dial-turn", "gripper is open", "rotate the dial left", "push", G, "dial", "left"),
-        ("drawer-open", "gripper is open", "pull drawer open", "pull", G, "drawer handle", "goal"),
-        ("drawer-close", "gripper is open", "gripper in front of drawer", "beside", G, "drawer handle", "away"),
-        ("handle-press-side", "gripper is open", "press the handle down", "push", G, "handle", "down"),
-        ("handle-pull-side", "gripper is open", "lift the handle", "move", "handle", "handle", "up"),
-        ("reach", "gripper is open", "reach toward the goal", "reach", G, GOAL, None),
-        ("reach", "gripper is open", "stay at the target", "hold", G, GOAL, None),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("task", "condition", "text", "verb", "moved", "target", "direction"), CASES["steps"])
 def test_the_verb_objects_and_direction_of_a_step(task, condition, text, verb, moved, target, direction):
     (step,) = parse_steps(plan_of(task, (condition, text)))
-    assert (step.verb, step.moved, step.target, step.direction) == (verb, moved, target, direction)
+    assert (step.verb, step.moved, step.target, step.direction or "") == (verb, moved, target, direction)
 
 
-GRASP = ("gripper is near the stick handle and gripper is open", "close the gripper around the stick")
-HELD = "gripper is near the stick handle and gripper is closed"
-
-
-@pytest.mark.parametrize(
-    ("condition", "text", "moved", "target"),
-    [
-        (HELD, "bring the stick in line with the thermos", "stick", "thermos"),
-        (HELD, "pull the thermos to the goal with the stick", "thermos", GOAL),
-        (HELD, "shove the thermos with the stick", "stick", "thermos"),
-        (HELD + " and the stick is right of the thermos", "move the stick onwards", "stick", "thermos"),
-        (HELD, "move the gripper over the goal", "stick", GOAL),
-    ],
-)
+@pytest.mark.parametrize(("condition", "text", "moved", "target"), CASES["held"])
 def test_a_held_object_moves_to_the_target_in_the_words_or_the_condition(condition, text, moved, target):
-    *_, step = parse_steps(plan_of("stick-pull", GRASP, (condition, text)))
+    grasp = ("gripper is near the stick handle and gripper is open", "close the gripper around the stick")
+    *_, step = parse_steps(plan_of("stick-pull", grasp, (f"gripper is near the stick handle and {condition}", text)))
     assert (step.moved, step.target) == (moved, target)
 
 
-@pytest.mark.parametrize(
-    ("task", "step"),
-    [
-        ("assembly", ("carry", "wrench ring", "peg")),  # the point that the condition compares
-        ("push-wall", ("carry", "puck", GOAL)),  # over the wall is on the way to the goal
-    ],
-)
-def test_the_last_steps_of_a_shipped_plan(task, step):
-    assert [(role.verb, role.moved, role.target) for role in roles_of(OWN[task])[3:]] == [step] * 2
+def test_the_last_steps_of_a_shipped_plan():
+    for task, moved, target in (
+        ("assembly", "wrench ring", "peg"),  # the point that the condition compares
+        ("push-wall", "puck", GOAL),  # over the wall is on the way to the goal
+    ):
+        assert [(role.verb, role.moved, role.target) for role in roles_of(OWN[task])[3:]] == [
+            ("carry", moved, target)
+        ] * 2
 
 
 @pytest.mark.parametrize("task", OWN)
-def test_shipped_plans_are_parsed_and_their_canonical_form_is_a_plan(task):
+def test_the_canonical_form_of_a_shipped_plan_is_a_plan_and_its_own_canonical_form(task):
     for plan in (OWN[task], MT10_SKILLS[task]):
         report = explain_canonical(plan)
         assert report.source in ("plan", "completed")
@@ -110,14 +74,13 @@ def test_shipped_plans_are_parsed_and_their_canonical_form_is_a_plan(task):
         for role in roles_of(plan):
             for name in role.objects:
                 role_object(plan.definition, name)
-
-
-@pytest.mark.parametrize("task", OWN)
-def test_the_canonical_form_of_a_canonical_plan_is_itself(task):
     plan = canonical_plan(OWN[task])
     again = canonical_plan(without_roles(plan))
     assert without_roles(again) == without_roles(plan)
     assert meanings(again) == meanings(plan)
+    tree = explain_canonical(as_branches(OWN[task]))
+    assert (tree.source, roles_of(tree.plan)) == (explain_canonical(OWN[task]).source, roles_of(plan))
+    assert lw.ConditionalPlan.from_json(task, as_branches(OWN[task]).to_json()) == as_branches(OWN[task])
 
 
 def test_the_parser_does_not_use_the_shipped_plans_or_skills():
@@ -160,13 +123,9 @@ def test_a_completed_plan_keeps_its_own_conditions_as_far_as_they_are_right():
 
 @given(st.sampled_from(sorted(OWN)), st.lists(st.integers(0, 5), min_size=1, max_size=4), st.booleans())
 def test_a_completed_plan_is_complete_wherever_the_hand_is(task, numbers, is_short):
-    own = OWN[task].steps
-    steps = [own[number % len(own)] for number in numbers]
-    report = explain_canonical(
-        plan_of(
-            task, *((str(step.condition.clauses[-1] if is_short else step.condition), step.skill) for step in steps)
-        )
-    )
+    steps = [OWN[task].steps[number % len(OWN[task].steps)] for number in numbers]
+    conditions = [str(step.condition.clauses[-1] if is_short else step.condition) for step in steps]
+    report = explain_canonical(plan_of(task, *zip(conditions, (step.skill for step in steps), strict=True)))
     if report.source == "completed":
         assert coverage_of(report.plan.definition, report.plan.steps) >= canonical.MIN_COVERAGE
 
@@ -189,21 +148,16 @@ def test_an_unreadable_step_is_left_out_by_name():
     }  # fmt: skip
 
 
-def test_objects_of_a_custom_task(tmp_path):
-    (tmp_path / "tasks.toml").write_text("""
-[stack-cup]
-description = "Put the cup on the saucer."
-objects.cup = "obs[4:7]"
-objects.saucer = "obs[36:39]"
-points."cup rim" = { object = "cup", offset = [0.0, 0.0, 0.05] }
-""")
-    tasks = lw.load_tasks(tmp_path / "tasks.toml")
+def test_objects_of_a_custom_task():
+    objects = {"cup": "obs[4:7]", "saucer": "obs[36:39]"}
+    points = {"cup rim": {"object": "cup", "offset": [0.0, 0.0, 0.05]}}
+    task = lw.Task.from_json("stack-cup", {"description": "Stack it.", "objects": objects, "points": points})
     steps = [
         ("gripper is not near the cup rim", "lower the gripper around the cup"),
         ("gripper is near the cup rim", "grab the cup"),
         ("gripper is near the cup rim and gripper is closed", "lift the cup onto the saucer"),
     ]
-    parsed = parse_steps(plan_of(tasks["stack-cup"], *steps))
+    parsed = parse_steps(plan_of(task, *steps))
     assert [(step.target, step.moved) for step in parsed] == [("cup", G), ("cup", G), ("saucer", "cup")]
 
 
@@ -240,19 +194,10 @@ def test_the_order_of_clauses_does_not_matter(random, task):
     assert [step.skill for step in report.plan.steps] == [step.skill for step in other.plan.steps]
 
 
-@pytest.mark.parametrize("task", list(OWN))
-def test_a_tree_of_branches_has_the_canonical_form_of_the_flat_plan(task):
-    plan = OWN[task]
-    flat, tree = explain_canonical(plan), explain_canonical(as_branches(plan))
-    assert tree.source == flat.source
-    assert [step.role for step in tree.plan.steps] == [step.role for step in flat.plan.steps]
-    assert lw.ConditionalPlan.from_json(task, as_branches(plan).to_json()) == as_branches(plan)
-
-
 def test_the_longest_name_is_marked():
     task = OWN["drawer-open"].definition
     assert mark_objects("Pull the drawer handle, then the drawer", task) == "pull <drawer handle>, then <drawer handle>"
-    assert first_object(OWN["reach"].definition) is None
+    assert first_object(lw.TASKS["reach"]) is None
 
 
 def test_the_hand_cannot_be_its_own_target():
@@ -277,19 +222,14 @@ def test_canonical_plans_are_plans_with_roles():
     assert all(step.skill == step.role.skill for plan in CANONICAL.values() for step in plan.steps)
 
 
-@pytest.mark.parametrize("plans", [CANONICAL, OWN], ids=["roles", "none"])
-def test_roles_are_kept_in_json(plans):
-    again = Plans.from_json(plans.to_json())
-    assert again == plans
-    assert again.numbers == plans.numbers
-
-
-def test_the_confidence_of_earlier_files_is_ignored():
-    assert ConditionalPlan.from_json("dial-turn", {**DIAL.to_json(), "confidence": 0.5}) == DIAL
-
-
-def test_the_json_of_a_plan_without_roles_is_its_text():
+def test_json_keeps_roles():
+    for plans in (CANONICAL, OWN):
+        again = Plans.from_json(plans.to_json())
+        assert again == plans
+        assert again.numbers == plans.numbers
     assert OWN["push"].to_json() == {"plan": str(OWN["push"])}
+    earlier = {**DIAL.to_json(), "confidence": 0.5}  # a key of earlier versions, which is ignored
+    assert ConditionalPlan.from_json("dial-turn", earlier) == DIAL
 
 
 def test_roles_do_not_change_which_queries_are_answered():
@@ -308,23 +248,17 @@ def test_the_fallback_plan_follows_the_steps_of_the_plan():
     assert DIAL.steps[: len(own.steps)] == own.steps
     assert [step.role.fallback for step in DIAL.steps] == [False] * len(own.steps) + [True] * 5
     assert [step.role.verb for step in DIAL.steps[-5:]] == ["approach", "descend", "close", "move", "carry"]
-
-
-def test_the_fallback_plan_also_has_a_fallback():
-    wrong = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "ponder")])
-    plan = canonical_plan(wrong, fallback=True)
-    assert [step.role.fallback for step in plan.steps] == [False] * 4 + [True] * 5
-    assert [step.role.verb for step in plan.steps[-3:]] == ["close", "carry", "move"], "first what it did not try"
+    replaced = canonical_plan(plan_of("push", ("gripper is open", "ponder")), fallback=True)
+    assert [step.role.fallback for step in replaced.steps] == [False] * 4 + [True] * 5
+    assert [step.role.verb for step in replaced.steps[-3:]] == ["close", "carry", "move"], "first what it did not try"
 
 
 def test_a_role_names_the_objects_of_a_step():
-    (step,) = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "put the puck at the target location")]).steps
-    task = lw.TASKS["push"]
-    assert step.mentions(task) == {"robot's gripper", "puck", "target location"}
-    role = StepRole("push", "robot's gripper", "puck", "push", "goal")
-    assert replace(step, skill="nudge it", role=role).mentions(task) == {"robot's gripper", "puck", "target location"}
-    role = replace(role, direction="left")
-    assert replace(step, skill="nudge it", role=role).mentions(task) == {"robot's gripper", "puck"}
+    (step,) = plan_of("push", ("gripper is open", "put the puck at the target location")).steps
+    task, role = lw.TASKS["push"], StepRole("push", G, "puck", "push", "goal")
+    assert step.mentions(task) == {G, "puck", GOAL}
+    assert replace(step, skill="nudge it", role=role).mentions(task) == {G, "puck", GOAL}
+    assert replace(step, skill="nudge it", role=replace(role, direction="left")).mentions(task) == {G, "puck"}
 
 
 def test_vectors_of_roles_have_a_one_for_verb_and_manner_each():
@@ -333,25 +267,15 @@ def test_vectors_of_roles_have_a_one_for_verb_and_manner_each():
     assert len({tuple(vector) for vector in vectors}) > 3
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"roles": []}, "one entry per step"),
-        ({"more": 1}, "must be an object"),
-        ({"roles": {"verb": "juggle"}}, "verb"),
-        ({"roles": {"direction": "north"}}, "direction"),
-        ({"roles": {"target": "moon"}}, "object of task 'dial-turn'"),
-        ({"roles": {"confidence": None}}, "confidence"),
-        ({"roles": {"colour": "red"}}, "role must be an object"),
-    ],
-)
-def test_broken_json_is_refused(change, message):
+def test_broken_json_is_refused():
     row = DIAL.to_json()
-    roles = change.get("roles")
-    if isinstance(roles, dict):
-        change = {"roles": [row["roles"][0] | roles, *row["roles"][1:]]}
-    with pytest.raises(PlanError, match=message):
-        ConditionalPlan.from_json("dial-turn", row | change)
+    role, *others = row["roles"]
+    changes = {"verb": "juggle", "direction": "north", "target": "moon", "confidence": None, "colour": "red"}
+    wrong = [("roles", [role | {name: value}, *others], name) for name, value in changes.items()]
+    for key, value, message in [("roles", [], "one entry per step"), ("more", 1, "must be an object"), *wrong]:
+        message = {"target": "object of task 'dial-turn'"}.get(message, message)
+        with pytest.raises(PlanError, match=message):
+            ConditionalPlan.from_json("dial-turn", row | {key: value})
 
 
 def test_a_plan_in_order_of_priority_keeps_its_steps():
@@ -362,6 +286,6 @@ def test_a_plan_in_order_of_priority_keeps_its_steps():
         ("gripper not above puck and gripper not near puck", "place the gripper above the puck"),
     ]
     for pairs in (rules, rules[::-1]):
-        assert explain_canonical(lw.ConditionalPlan.from_pairs("pick-place", pairs)).source == "plan"
+        assert explain_canonical(plan_of("pick-place", *pairs)).source == "plan"
     rules[0] = ("gripper above puck or gripper near puck and gripper closed", rules[0][1])  # also before the grasp
-    assert explain_canonical(lw.ConditionalPlan.from_pairs("pick-place", rules)).source == "completed"
+    assert explain_canonical(plan_of("pick-place", *rules)).source == "completed"

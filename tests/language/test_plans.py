@@ -34,23 +34,22 @@ def test_a_plan_is_in_canonical_spelling(drawn):
         ("push the puck", "push the puck"),
         ("push puck", "push the puck"),
         ("  push\n the   puck ", "push the puck"),
-        ("let_go puck", "let go the puck"),
         ("_let__go_ puck", "let go the puck"),
         ('say "hello" to the \\ puck', 'say "hello" to the \\ puck'),
-        *(
-            (wrong, None)
-            for wrong in ("don't", "pick-up the puck", "3 steps forward", "", " \n", "_", "(push)", "# push")
-        ),
     ],
 )
-def test_a_skill_is_kept_in_canonical_spelling_or_refused(written, skill):
-    if skill is None:
-        with pytest.raises(PlanError, match="step 1 of plan 'push': skill"):
-            plan("push", ("gripper open", written))
-    else:
-        kept = plan("push", ("gripper open", written))
-        assert kept.steps[0].skill == skill
-        assert parse_plan(str(kept)) == kept
+def test_a_skill_is_kept_in_canonical_spelling(written, skill):
+    kept = plan("push", ("gripper open", written))
+    assert kept.steps[0].skill == skill
+    assert parse_plan(str(kept)) == kept
+
+
+@pytest.mark.parametrize(
+    "written", ["don't", "pick-up the puck", "3 steps forward", "", " \n", "_", "(push)", "# push"]
+)
+def test_a_skill_without_a_plain_word_is_refused(written):
+    with pytest.raises(PlanError, match="step 1 of plan 'push': skill"):
+        plan("push", ("gripper open", written))
 
 
 def test_a_condition_is_kept_in_canonical_spelling():
@@ -60,52 +59,37 @@ def test_a_condition_is_kept_in_canonical_spelling():
 
 def test_reasons_do_not_count_for_equality():
     same = ConditionalPlan("push", (PlanStep(OPEN, "push the puck", "so"),))
-    assert same == plan()
-    assert hash(same) == hash(plan())
+    assert (same, hash(same)) == (plan(), hash(plan()))
 
 
 @pytest.mark.parametrize(
-    ("task", "steps", "error", "message"),
+    ("steps", "message"),
     [
-        ("push", (), PlanError, "1 to 1000 steps, got 0"),
-        ("push", plan().steps * 1001, PlanError, "1 to 1000 steps, got 1001"),
-        ("psuh", plan().steps, ValueError, "'push'"),
-        ("push", (PlanStep(OPEN, "push"), None), TypeError, "step"),
-        ("push", (PlanStep(DRAWER_NEAR, "x"),), PlanError, "step 1"),
-        ("push", (PlanStep(OPEN, "push"), PlanStep(Query((Clause("puck", "open"),)), "push")), PlanError, "step 2"),
-        (
-            "push",
-            (PlanStep(OPEN, "x", goal=parse_query("gripper near drawer handle", "drawer-open")),),
-            PlanError,
-            "step 1",
-        ),
+        ((), "1 to 1000 steps, got 0"),
+        (plan().steps * 1001, "1 to 1000 steps, got 1001"),
+        ((PlanStep(DRAWER_NEAR, "x"),), "step 1"),
+        ((PlanStep(OPEN, "push"), PlanStep(Query((Clause("puck", "open"),)), "push")), "step 2"),
+        ((PlanStep(OPEN, "x", goal=DRAWER_NEAR),), "step 1"),
     ],
 )
-def test_a_faulty_plan_is_refused(task, steps, error, message):
-    with pytest.raises(error, match=message):
-        ConditionalPlan(task, steps)
+def test_a_faulty_plan_is_refused(steps, message):
+    with pytest.raises(PlanError, match=message):
+        ConditionalPlan("push", steps)
 
 
 def test_from_pairs_accepts_any_spelling_and_refuses_the_rest():
     assert plan("push", ("Is the gripper open?", "push puck")) == plan("push", ("gripper open", "push the puck"))
     with pytest.raises(QueryError, match="nearest query"):
         plan("push", ("the gripper flies", "push"))
-    with pytest.raises(ValueError, match="did you mean 'push'"):
-        ConditionalPlan.from_pairs("psuh", [("gripper open", "push")])
 
 
 def test_plans_are_a_sorted_immutable_mapping():
     drawer = parse_plan(DRAWER)
     plans = Plans([plan(), drawer])
-    assert list(plans) == ["drawer-open", "push"]
-    assert plans == {"push": plan(), "drawer-open": drawer}
+    assert list(plans.items()) == [("drawer-open", drawer), ("push", plan())]
     assert plans.num_steps == 3
-    assert plans.skills == (
-        "lower the gripper around the drawer handle",
-        "place the gripper above the drawer handle",
-        "pull back",
-        "push the puck",
-    )
+    lower, place = (f"{verb} the drawer handle" for verb in ("lower the gripper around", "place the gripper above"))
+    assert plans.skills == (lower, place, "pull back", "push the puck")
     assert as_plans(plans) is plans
     assert as_plans(dict(plans)) == as_plans([*plans.values()]) == plans
     with pytest.raises(TypeError):
@@ -180,10 +164,11 @@ def test_a_plan_has_the_usual_goals_of_its_skills():
 
 
 def test_a_step_s_own_goal_replaces_the_usual_one():
-    near = parse_query("the gripper is near the puck", "push")
-    usual = ConditionalPlan("push", (PlanStep(OPEN, "place the gripper above the puck"),))
-    own = ConditionalPlan("push", (PlanStep(OPEN, "place the gripper above the puck", goal=near),))
-    same = ConditionalPlan("push", (PlanStep(OPEN, "place gripper above puck", goal=usual.goals[0]),))
+    def placed(goal=None):
+        return ConditionalPlan("push", (PlanStep(OPEN, "place gripper above puck", goal=goal),))
+
+    near, usual = parse_query("the gripper is near the puck", "push"), placed()
+    own, same = placed(near), placed(usual.goals[0])
     assert own != usual == same
     assert own.goals == (near,)
     assert same.steps[0].goal is None

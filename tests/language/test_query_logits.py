@@ -6,6 +6,7 @@ import random
 import numpy as np
 import pytest
 import torch
+from cases import read_cases
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from states import observation, random_states, real_states
@@ -56,10 +57,13 @@ def test_soft_and_hard_truth_agree(seeds, n, pairs):
     assert compared > pairs
 
 
-@pytest.mark.parametrize("task", ["reach", "peg-insert-side", "drawer-open"])
-def test_soft_and_hard_truth_agree_on_an_experts_states(task):
-    states = torch.from_numpy(real_states(task))
-    same_sign(everything(), states, torch.full((len(states),), task_id(task)))
+def test_soft_and_hard_truth_agree_on_an_experts_states():
+    for task in ("reach", "peg-insert-side", "drawer-open"):
+        states = torch.from_numpy(real_states(task))
+        same_sign(everything(), states, torch.full((len(states),), task_id(task)))
+
+
+CASES = read_cases("language/queries.toml")
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -96,27 +100,7 @@ def logit_of(query, task="push", temperature=1.0, **at):
     return logit.item(), gradient
 
 
-@pytest.mark.parametrize(
-    ("query", "at", "expected"),
-    [
-        ("gripper near puck", {"hand": [0.0, 0.0, 0.03]}, 1.0),  # a centimetre inside
-        ("gripper near puck", {"hand": [0.0, 0.06, 0.0]}, -2.0),
-        ("gripper not near puck", {"hand": [0.0, 0.06, 0.0]}, 2.0),
-        ("gripper around puck", {"hand": [0.01, 0.0, -0.02]}, 2.0),
-        ("gripper left of puck", {"hand": [0.34, 5.0, 5.0]}, 30.0),
-        ("gripper left of puck", {"hand": [2.04, 0.0, 0.0]}, 200.0),
-        ("gripper mostly below puck", {"hand": [0.0, 0.0, -5.0]}, 523.0),
-        ("puck touching the table", {"one": [9.0, 9.0, 0.05]}, -3.0),
-        ("puck is not touching the table", {"one": [9.0, 9.0, 0.05]}, 3.0),
-        ("gripper open", {"opening": 0.85}, 2.0),
-        ("gripper closed", {"opening": 0.85}, -2.0),
-        ("gripper above puck", {"hand": [0.0, 0.01, 0.005]}, 0.5),  # the least of its two parts
-        ("gripper above puck", {"hand": [0.0, 0.01, 0.5]}, 1.0),
-        ("gripper not above puck", {"hand": [0.0, 0.01, 0.5]}, -1.0),
-        ("gripper open and not above puck", {"hand": [0.0, 0.01, 0.5], "opening": 1.0}, -1.0),
-        ("gripper open and above puck", {"hand": [0.0, 0.01, 0.5], "opening": 0.0}, -15.0),
-    ],
-)
+@pytest.mark.parametrize(("query", "at", "expected"), CASES["logits"])
 def test_a_logit_is_the_distance_to_the_threshold_over_the_temperature(query, at, expected):
     logit, gradient = logit_of(query, **at)
     assert logit == pytest.approx(expected, rel=1e-4)
@@ -125,29 +109,16 @@ def test_a_logit_is_the_distance_to_the_threshold_over_the_temperature(query, at
     assert half == pytest.approx(expected / 2, rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("query", "at", "reached"),
-    [
-        ("gripper near puck", {"hand": [0.03, 0.0, 0.0]}, [0, 4]),
-        ("gripper near puck", {"hand": [0.04, 0.0, 0.0]}, [0, 4]),  # on the threshold
-        ("gripper above puck", {"hand": [0.0, 0.01, 0.0]}, [2, 6]),  # on the threshold
-        ("gripper above puck", {"hand": [0.0, 0.03, 0.5]}, [1, 5]),
-        ("gripper not above puck", {"hand": [0.0, 0.03, 0.5]}, [1, 5]),
-        ("puck touching the table", {"one": [0.3, 0.3, 0.02]}, [6]),  # on the threshold
-        ("gripper open", {"opening": 0.75}, [3]),  # on the threshold
-        ("gripper left of puck", {"hand": [3.0, 0.0, 0.0]}, [0, 4]),
-        ("gripper open and left of puck", {"hand": [3.0, 0.0, 0.0], "opening": 0.8}, [3]),
-    ],
-)
+@pytest.mark.parametrize(("query", "at", "reached"), CASES["gradients"])
 def test_the_gradient_is_that_of_the_comparison_that_decides(query, at, reached):
     _, gradient = logit_of(query, **at)
     assert gradient.nonzero().flatten().tolist() == reached
     assert gradient.abs().max() == pytest.approx(20.0 if reached == [3] else 100.0, rel=1e-4)
 
 
-@pytest.mark.parametrize(("query", "expected"), [("gripper open", -1e-6), ("gripper closed", 1e-6)])
-def test_on_the_threshold_a_logit_has_the_sign_of_the_hard_truth(query, expected):
-    assert logit_of(query, opening=0.75)[0] == pytest.approx(expected)
+def test_on_the_threshold_a_logit_has_the_sign_of_the_hard_truth():
+    assert logit_of("gripper open", opening=0.75)[0] == pytest.approx(-1e-6)
+    assert logit_of("gripper closed", opening=0.75)[0] == pytest.approx(1e-6)
 
 
 def test_padding_is_far_below_at_any_temperature():

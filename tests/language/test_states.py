@@ -67,15 +67,13 @@ def test_a_layout_s_own_threshold_counts():
 
 
 def test_states_are_listed_and_in_prompts():
-    asked = supported_queries(HOUSE)
-    states = ("open", "closed", "wide open")
-    assert asked[-8:-2] == tuple(f"the {thing} is {state}" for thing in THINGS for state in states)
-    assert not {*asked[-8:-2]} & {*supported_queries(HOUSE, published_only=True)}
+    listed = tuple(f"the {thing} is {state}" for thing in THINGS for state in ("open", "closed", "wide open"))
+    assert supported_queries(HOUSE)[-8:-2] == listed
+    assert not {*listed} & {*supported_queries(HOUSE, published_only=True)}
     assert str(nearest_query("the dor is opn", HOUSE).query) == "the door is open"
-    told = "or that the robot's gripper or door or light switch is open or closed or wide open. Several conditions"
-    assert told in plan_prompt(HOUSE, "basic_py", vocabulary=True)
-    told = "or that the robot's gripper is open or closed or wide open. Several"
-    assert told in plan_prompt("push", "basic_py", vocabulary=True)
+    for task, openable in ((HOUSE, "robot's gripper or door or light switch"), ("push", "robot's gripper")):
+        part = f"or that the {openable} is open or closed or wide open. Several conditions"
+        assert part in plan_prompt(task, "basic_py", vocabulary=True)
 
 
 def test_a_custom_state_is_a_predicate_of_objects_with_an_opening(monkeypatch):
@@ -85,13 +83,11 @@ def test_a_custom_state_is_a_predicate_of_objects_with_an_opening(monkeypatch):
     monkeypatch.setitem(STATES, "on", STATES["open"])
     monkeypatch.setitem(STATES, "ajar", ajar)
     assert str(parse_query("Isn't the light switch on?", HOUSE)) == "the light switch is not on"
-    assert "the door is ajar" in supported_queries(HOUSE)
-    assert "the robot's gripper is ajar" not in supported_queries(HOUSE)
+    assert {"the door is ajar", "the robot's gripper is ajar"} & {*supported_queries(HOUSE)} == {"the door is ajar"}
     state = torch.zeros(4, 15)
     state[:, 10] = torch.tensor([0.05, 0.5, 0.75, 0.8])
-    truth, _ = answers(
-        state, "the door is ajar", "the door is not ajar", "the door is on and the light switch is not on"
-    )
+    asked = "the door is ajar", "the door is not ajar", "the door is on and the light switch is not on"
+    truth, _ = answers(state, *asked)
     assert truth.T.tolist() == [[False, True, True, False], [True, False, False, True], [False, False, False, True]]
     with pytest.raises(QueryError, match=r"the cup .only the gripper and the door and the light switch can be"):
         parse_query("the cup is on", HOUSE)
@@ -119,11 +115,10 @@ def test_a_faulty_state_is_refused(name, parts, message):
 def test_openings_are_written_and_read_again():
     assert HOUSE.to_json()["objects"]["door"] == {"position": "obs[4:7]", "opening": "obs[10]"}
     assert Task.from_json(HOUSE.name, HOUSE.to_json()) == HOUSE
-    for at in ({"opening": "obs[3]"}, {"position": "obs[0:3]"}, {"position": "obs[0:3]", "opening": 3}):
-        with pytest.raises(ValueError, match=r"object 'door': .* opening"):
+    position = {"position": "obs[0:3]"}
+    for at in ({"opening": "obs[3]"}, position, position | {"opening": 3}, {"openin": "obs[3]"}):
+        with pytest.raises(ValueError, match=r"object 'door': .*opening"):
             Task.from_json("mine", {"description": "Mine.", "objects": {"door": at}})
-    with pytest.raises(ValueError, match=r"object 'door': .*did you mean 'opening'"):
-        Task.from_json("mine", {"description": "Mine.", "objects": {"door": {"openin": "obs[3]"}}})
 
 
 def test_an_action_may_have_no_displacement_and_no_gripper():

@@ -9,6 +9,7 @@ import language_world as oracle
 import numpy as np
 import pytest
 import torch
+from cases import read_cases
 from tensordict import TensorDict
 
 import lw_torchrl as lw
@@ -16,19 +17,9 @@ from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.objects import GRIPPER, NamedObject, read_objects, write_objects
 from lw_torchrl.language.plan_files import parse_plan
 from lw_torchrl.language.skills import SkillError
-from lw_torchrl.language.tasks import (
-    MT10,
-    MT50,
-    TASKS,
-    Task,
-    TaskError,
-    check_task,
-    get_task,
-    load_tasks,
-    resolve_tasks,
-    task_id,
-)
+from lw_torchrl.language.tasks import MT10, MT50, TASKS, Task, TaskError, get_task, load_tasks, resolve_tasks, task_id
 
+CASES = read_cases("language/tasks.toml")
 HAND = NamedObject(GRIPPER, (0, 1, 2))
 
 
@@ -62,38 +53,32 @@ def test_descriptions_are_different_sentences_and_not_the_published_ones():
 
 
 @pytest.mark.parametrize("name", MT50)
-def test_objects_are_the_published_ones(name):
+def test_objects_and_their_positions_are_the_published_ones(name):
     relations = [query.split(" is near ") for query in oracle.enumerate_base_queries(name) if " is near " in query]
     names = {side.removeprefix("the ") for sides in relations for side in sides}
     published = TASKS[name].published
-    assert set(published.object_names) == names
+    assert sorted(published.object_names) == sorted(names)
     assert published.object_names[0] == GRIPPER
-    assert len(published.objects) == len(names)
     assert all(named.offset == (0.0, 0.0, 0.0) for named in published.objects)
     assert TASKS[name].objects[: len(names)] == published.objects, "our points come last"
-
-
-@pytest.mark.parametrize("name", MT50)
-def test_positions_are_read_where_the_published_package_reads_them(name):
     observation = np.random.default_rng(0).uniform(-1, 1, 39)
     parsed = oracle.ParsedObs.from_obs(observation)
-    for named in TASKS[name].published.objects:
+    for named in published.objects:
         expected = oracle._get_object_location(name, f"the {named.name}", parsed)
         np.testing.assert_array_equal(read(named.position, observation), expected, err_msg=named.name)
 
 
 @pytest.mark.parametrize("name", MT50)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_positions_of_a_batch(name, dtype):
-    observation = torch.rand(2, 3, 39, generator=torch.Generator().manual_seed(0)).to(dtype)
-    positions = TASKS[name].positions(observation)
-    assert tuple(positions) == TASKS[name].object_names
-    for named in TASKS[name].objects:
-        at = positions[named.name]
-        assert at.shape == (2, 3, 3)
-        assert at.dtype == dtype
-        expected = torch.stack([torch.from_numpy(read(named.position, o)) for o in observation.reshape(6, 39)])
-        assert torch.equal(at.reshape(6, 3), expected.to(dtype) + torch.tensor(named.offset, dtype=dtype))
+def test_positions_of_a_batch(name):
+    for dtype in (torch.float32, torch.float64):
+        observation = torch.rand(2, 3, 39, generator=torch.Generator().manual_seed(0)).to(dtype)
+        positions = TASKS[name].positions(observation)
+        assert tuple(positions) == TASKS[name].object_names
+        for named in TASKS[name].objects:
+            expected = torch.stack([torch.from_numpy(read(named.position, o)) for o in observation.reshape(6, 39)])
+            expected = expected.to(dtype) + torch.tensor(named.offset, dtype=dtype)
+            assert torch.equal(positions[named.name], expected.reshape(2, 3, 3))
+            assert positions[named.name].dtype == dtype
     assert TASKS[name].positions(observation[0, 0])[GRIPPER].tolist() == observation[0, 0, :3].tolist()
 
 
@@ -112,19 +97,10 @@ def test_positions_that_are_not_plain_slices():
 # ---- names and ids
 
 
-@pytest.mark.parametrize(
-    ("names", "expected"),
-    [
-        ("MT10", MT10),
-        ("MT50", MT50),
-        ("pick-place", ("pick-place",)),
-        (["push", "door-open"], ("door-open", "push")),
-        ({"push": 1, "assembly": 2}, ("assembly", "push")),
-        ((name for name in ["window-open", "basketball"]), ("basketball", "window-open")),
-    ],
-)
-def test_resolve_tasks_accepts_a_set_a_name_or_names(names, expected):
-    assert resolve_tasks(names) == expected
+def test_resolve_tasks_accepts_a_set_a_name_or_names():
+    assert [resolve_tasks(names) for names in ("MT10", "MT50", "pick-place")] == [MT10, MT50, ("pick-place",)]
+    for names in (["push", "assembly"], {"push": 1, "assembly": 2}, (name for name in ["push", "assembly"])):
+        assert resolve_tasks(names) == ("assembly", "push")
 
 
 @pytest.mark.parametrize(
@@ -136,8 +112,6 @@ def test_resolve_tasks_accepts_a_set_a_name_or_names(names, expected):
         (["reach", "drawer-opne"], ValueError, ["'drawer-opne'", "'drawer-open'"]),
         (["MT10"], ValueError, ["'MT10'"]),
         ("push, reach", ValueError, ["'push, reach'", "spaces", "list"]),
-        (["push", "reach", "push"], ValueError, ["once", "push"]),
-        ([], ValueError, ["at least one task"]),
         ([None], TypeError, ["None"]),
     ],
 )
@@ -147,18 +121,15 @@ def test_resolve_tasks_names_the_fault(names, error, words):
     assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
-@pytest.mark.parametrize("function", [check_task, get_task])
 @pytest.mark.parametrize("name", ["reahc", "", "Reach", " reach", "reach-v3"])
-def test_an_unknown_task_is_a_value_error(function, name):
+def test_an_unknown_task_is_a_value_error(name):
     with pytest.raises(ValueError, match="task must be one of"):
-        function(name)
+        get_task(name)
 
 
-@pytest.mark.parametrize(
-    ("name", "number"), [("stack-blocks", 650718257), ("reahc", 893438262), ("reach-v3", 94884373), ("x", 950319221)]
-)
-def test_the_id_of_any_other_name_never_changes(name, number):
-    assert task_id(name) == number
+def test_the_id_of_any_other_name_never_changes():
+    ids = {"stack-blocks": 650718257, "reahc": 893438262, "reach-v3": 94884373, "x": 950319221}
+    assert {name: task_id(name) for name in ids} == ids
 
 
 @pytest.mark.parametrize("name", ["", "Reach", " reach", "reach_v3", "reach-", "-", "../reach", "3d", "reach\n", "ré"])
@@ -175,10 +146,10 @@ def test_a_suite_s_name_may_have_a_hyphen():
     assert parse_plan(str(plan), tasks={task.name: task}).task == "my-desk/hover-low"
 
 
-@pytest.mark.parametrize("function", [lw.load_plans, lw.load_skills, lw.decode_plan, lw.planners.plan_prompt])
-def test_help_begins_with_a_short_signature(function):
-    assert "lw.TASKS, the 50 tasks from assembly to window-open" in render_doc(function)
-    assert len(str(signature(function))) < 500
+def test_help_begins_with_a_short_signature():
+    for function in (lw.load_plans, lw.load_skills, lw.decode_plan, lw.planners.plan_prompt):
+        assert "lw.TASKS, the 50 tasks from assembly to window-open" in render_doc(function)
+        assert len(str(signature(function))) < 500
 
 
 # ---- custom tasks
@@ -237,9 +208,8 @@ points.shadow = ["obs[4]", "obs[5]", 0.0]
 points."gripper tip" = {object = "robot's gripper", offset = [0.0, 0.0, -0.04]}
 """,
     )
-    assert list(mine) == list(TASKS)
-    assert all(mine[name] is TASKS[name] for name in MT50 if name != "push")
     push = mine["push"]
+    assert {**mine, "push": TASKS["push"]} == TASKS
     assert push.description == "Push the disc."
     assert push.published.object_names == (GRIPPER, "disc", "goal")
     assert push.objects[2:] == (
@@ -260,9 +230,7 @@ def test_a_custom_task_is_accepted_wherever_a_task_is(tmp_path):
     assert "the disc is touching the table" in lw.supported_queries(push)
     assert str(nearest_query("gripper abov the disk", push).query) == "the robot's gripper is above the disc"
     program = lw.QueryProgram({push: ["gripper near disc", "disc touching the table"]})
-    state, ids = torch.zeros(39), torch.tensor(task_id("push"))
-    assert program(state, ids).tolist() == [True, True]
-    assert (program.logits(state, ids) > 0).tolist() == [True, True]
+    assert program(torch.zeros(39), torch.tensor(task_id("push"))).tolist() == [True, True]
 
 
 def test_a_file_adds_tasks_that_the_simulator_lacks(tmp_path):
@@ -278,13 +246,8 @@ def test_a_file_adds_tasks_that_the_simulator_lacks(tmp_path):
         resolve_tasks(["stack-blocks"])
 
 
-@pytest.mark.parametrize("name", MT50)
-def test_a_task_is_the_same_read_from_its_json(name):
-    row = json.loads(json.dumps(TASKS[name].to_json()))
-    assert Task.from_json(name, row) == TASKS[name]
-
-
-def test_the_shipped_table_is_a_file_of_tasks():
+def test_tasks_are_the_same_read_from_json_and_from_a_file():
+    assert {name: Task.from_json(name, json.loads(json.dumps(TASKS[name].to_json()))) for name in MT50} == TASKS
     assert load_tasks(files("lw_torchrl.language") / "data" / "tasks.toml") == TASKS
 
 
@@ -307,31 +270,15 @@ def test_a_point_on_an_object_at_fixed_coordinates_is_written_as_a_point_on_that
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        *((PUSH.replace(old, new, 1), words) for old, new, words in CASES["changed"]),
+        *((PUSH + added, words) for added, words in CASES["added"]),
         ("[push", ["end of document"]),
         ('[psuh]\ndescription = "Push."', ["'psuh'", "objects", "did you mean 'push'"]),
-        (PUSH.replace("[push]", '["Push it"]'), ["'Push it'", "lower-case words"]),
         ("push = 3", ["'push'", "table", "3"]),
-        (PUSH + 'object.puck = "obs[4:7]"', ["'push'", "'object'", "did you mean 'objects'"]),
-        (PUSH.replace("description", "desciption"), ["'desciption'", "'description'"]),
         ('[push]\nobjects.disc = "obs[4:7]"', ["'push'", "description"]),
         ("[push]\ndescription = 3", ["'push'", "description", "3"]),
-        (PUSH.replace("obs[4:7]", "obs[4:8]"), ["'push'", "'disc'", "'obs[4:8]'", "'obs[4:7]'"]),
-        (PUSH.replace("obs[4:7]", "obs[37:40]"), ["'push'", "'disc'", "obs[39]"]),
-        (PUSH.replace("obs[4:7]", "state[4:7]"), ["'push'", "'disc'", "'obs[4:7]'"]),
-        (PUSH.replace('"obs[4:7]"', "[0.1, 0.2]"), ["'push'", "'disc'", "[0.1, 0.2]"]),
-        (PUSH.replace('"obs[4:7]"', "[0.1, nan, 0.2]"), ["'push'", "'disc'", "nan"]),
         (PUSH.replace('"obs[4:7]"', f"[0.1, {10**400}, 0.2]"), ["'push'", "'disc'"]),
-        (PUSH.replace(".disc", '."The Disc"'), ["'push'", "'The Disc'", "lower-case"]),
-        (PUSH.replace(".disc", '."robot\'s gripper"'), ["'push'", "robot's gripper"]),
         ('[push]\ndescription = "Push."\nobjects = ["disc"]', ["'push'", "objects", "disc"]),
-        (PUSH + "points = 3", ["'push'", "points", "3"]),
-        (PUSH + "points.edge = {object = 'disk', offset = [0, 0, 0]}", ["'edge'", "'disk'", "did you mean 'disc'"]),
-        (PUSH + "points.edge = {object = 'disc'}", ["'edge'", "offset"]),
-        (PUSH + "points.edge = {objekt = 'disc', offset = [0, 0, 0]}", ["'edge'", "'objekt'", "did you mean 'object'"]),
-        (PUSH + "points.edge = {object = 'disc', offset = [0, 0]}", ["'edge'", "offset"]),
-        (PUSH + "points.edge = {object = ['disc'], offset = [0, 0, 0]}", ["'edge'", "['disc']"]),
-        (PUSH + "points.edge = 'obs[4]'", ["'edge'", "'obs[4:7]'"]),
-        (PUSH + "points.disc = [0, 0, 0]", ["'push'", "distinct names", "'disc'"]),
         (PUSH + "points.disc = " + "[" * 5000, ["mine.toml"]),
         (PUSH + "points.disc = " + "9" * 5000, ["4300 digits"]),
     ],

@@ -1,6 +1,7 @@
 """The JSON Schema of plans: shipped plans satisfy it, JSON that satisfies it is a plan, servers may ignore it."""
 
 import json
+from itertools import product
 
 import jsonschema
 import pytest
@@ -70,17 +71,14 @@ def test_the_schema_has_all_supported_queries_and_no_others():
     (condition,) = [part["items"] for part in parts(PUSH) if "anyOf" in part.get("items", {})]
     sentences = []
     for clause in condition["anyOf"]:
-        words = clause["properties"]
-        for first in words["first"]["enum"]:
-            for predicate in words["is"]["enum"]:
-                for second in words.get("second", {"enum": [""]})["enum"]:
-                    sentences.append(f"{first} is {predicate} {second}".strip())
+        words = {"second": {"enum": [""]}, **clause["properties"]}
+        choices = product(*(words[name]["enum"] for name in ("first", "is", "second")))
+        sentences += [f"{first} is {predicate} {second}".strip() for first, predicate, second in choices]
     assert sorted(sentences) == sorted(lw.supported_queries("push"))
 
 
-def test_a_task_without_scripted_skills(tmp_path):
-    (tmp_path / "tasks.toml").write_text('[stack]\ndescription = "Stack it."\nobjects.brick = "obs[4:7]"\n')
-    stack = lw.load_tasks(tmp_path / "tasks.toml")["stack"]
+def test_a_task_without_scripted_skills():
+    stack = lw.Task.from_json("stack", {"description": "Stack it.", "objects": {"brick": "obs[4:7]"}})
     skills = {"push": lw.load_skills()["place the gripper above the puck"]}
     with pytest.raises(ValueError, match=r"stack.* no scripted skill.* free_skills=True"):
         plan_schema(stack, skills=skills)
@@ -105,16 +103,14 @@ def instances(schema):
 
 
 ANSWERS = st.tuples(st.sampled_from(lw.MT50), st.sampled_from(FORMATS), st.booleans()).flatmap(
-    lambda of: st.tuples(
-        st.just(of), instances(plan_schema(of[0], of[1], free_skills=of[2])), st.none() | st.integers(0, 900)
-    )
+    lambda of: st.tuples(st.just(of), instances(plan_schema(of[0], of[1], free_skills=of[2])))
 )
 
 
 @settings(max_examples=40, deadline=None)
-@given(ANSWERS)
-def test_json_that_satisfies_the_schema_is_a_plan_that_runs(drawn):
-    (task, format, free), value, cut = drawn
+@given(ANSWERS, st.none() | st.integers(0, 900))
+def test_json_that_satisfies_the_schema_is_a_plan_that_runs(drawn, cut):
+    (task, format, free), value = drawn
     text = json.dumps(value)[:cut]
     answer = read_reply(Reply(text), lw.TASKS[task], format, schema=plan_schema(task, format, free_skills=free))
     assert (answer.decoded.plan is None) == bool(answer.decoded.reason)
@@ -138,7 +134,7 @@ ANY_JSON = st.recursive(
 @settings(max_examples=40, deadline=None)
 @given(ANSWERS, ANY_JSON, st.randoms(use_true_random=False))
 def test_validation_agrees_with_json_schema(drawn, other, random):
-    (task, format, free), value, _ = drawn
+    (task, format, free), value = drawn
     schema = plan_schema(task, format, free_skills=free)
     assert passes(value, schema)
     part = random.choice([value, value["steps"], *value["steps"], *(step["condition"] for step in value["steps"])])
@@ -176,9 +172,7 @@ def test_json_in_a_fence_with_sentences_is_read():
     text = 'Sure!\n```json\n{"steps": [\n{"condition": "gripper open", "skill": "grab the puck"},\n'
     text += '{"skill": "wait"}\n]}\n```'
     answer = read_reply(Reply(text), lw.TASKS["push"], "basic_py", schema=PUSH)
-    assert [(str(step.condition), step.skill) for step in answer.decoded.plan.steps] == [
-        ("the robot's gripper is open", "grab the puck")
-    ]
+    assert answer.decoded.plan == lw.ConditionalPlan.from_pairs("push", [("gripper open", "grab the puck")])
     assert answer.decoded.scripted.steps[0].skill == "close the gripper around the puck"
     assert answer.notes == ("the answer does not follow the schema",)
     assert any(str(note).startswith("line 5: a step without a condition") for note in answer.decoded.notes)
@@ -224,20 +218,17 @@ def test_a_server_that_takes_no_schema(ask):
 
 
 def test_a_server_that_ignores_the_schema(ask, tmp_path):
-    options = {"constrain": True, "out": tmp_path / "out"}
-    server = FakeServer(lambda body: completion(lw.encode_plan(PLANS["push"], "basic_py")))
-    (answer,) = ask(server, "push", **options)
-    assert answer.decoded.plan == PLANS["push"]
-    assert answer.notes == ("the answer does not follow the schema",)
-    assert lw.decode_plan(answer.text, "push", "chain_py").plan == PLANS["push"]
-    (answer,) = ask(FakeServer(lambda body: completion("I like turtles")), "reach", **options)
-    assert answer.decoded.plan is None
-    assert answer.notes == ("the answer does not follow the schema",)
+    def answered(text, task="push", **options):
+        (answer,) = ask(FakeServer(lambda body: completion(text)), task, constrain=True, **options)
+        assert answer.notes == ("the answer does not follow the schema",)
+        return answer
+
+    answer = answered(lw.encode_plan(PLANS["push"], "basic_py"))
+    assert answer.decoded.plan == lw.decode_plan(answer.text, "push", "chain_py").plan == PLANS["push"]
+    assert answered("I like turtles", "reach", out=tmp_path / "out").decoded.plan is None
     assert (tmp_path / "out/a_model-constrained/chain_py/reach-0.py").read_text() == "I like turtles"
     text = write_structured(PLANS["push"], PLAN_FORMATS["basic_py"].style).replace("not above", "not really above")
-    (answer,) = ask(FakeServer(lambda body: completion(text)), "push", format="basic_py", constrain=True)
-    assert answer.decoded.plan is not None
-    assert answer.notes == ("the answer does not follow the schema",)
+    assert answered(text, format="basic_py").decoded.plan is not None
 
 
 def test_a_condition_with_or_is_a_sentence():

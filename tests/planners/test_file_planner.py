@@ -35,10 +35,8 @@ def test_answers_of_a_folder(folder, tmp_path):
         ("drawer-open", 0, True), ("drawer-open", 1, True), ("push", 0, True), ("push", 1, True),
     ]  # fmt: skip
     assert [answer.decoded.plan for answer in answers] == [None, PLANS["drawer-open"], None, PLANS["push"]]
-    assert (
-        lw.planners.FilePlanner(tmp_path / "copy").plans("push", format="chain_md", attempts=2)[1].text
-        == answers[3].text
-    )
+    (_, again) = lw.planners.FilePlanner(tmp_path / "copy").plans("push", format="chain_md", attempts=2)
+    assert again.text == answers[3].text
 
 
 def test_missing_answers(folder, tmp_path):
@@ -71,23 +69,16 @@ def test_lines_of_json(tmp_path):
     assert planner.plans("push", format="basic_py")[0].decoded.plan == PLANS["push"]
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
+def test_broken_lines(tmp_path):
+    for line, message in (
         ("[" * 10**5, "line 2: the line is not JSON"),
         (json.dumps({**ROW, "attempt": "0"}), "line 2: an answer needs the fields llm"),
         (json.dumps({**ROW, "format": "chain"}), "line 2: format must be one of"),
-        (
-            json.dumps({**ROW, "llm": "PaLM_2"}) + "\n" + json.dumps({**ROW, "llm": "PaLM/2"}),
-            "same folder name 'PaLM_2'",
-        ),
-    ],
-    ids=range(4),
-)
-def test_broken_lines(tmp_path, line, message):
-    (tmp_path / "answers.jsonl").write_text(json.dumps(ROW) + "\n" + line)
-    with pytest.raises(ValueError, match=message):
-        lw.planners.FilePlanner(tmp_path / "answers.jsonl")
+        (json.dumps({**ROW, "llm": "PaLM/2"}), "same folder name 'PaLM_2'"),
+    ):
+        (tmp_path / "answers.jsonl").write_text(json.dumps({**ROW, "llm": "PaLM_2"}) + "\n" + line)
+        with pytest.raises(ValueError, match=message):
+            lw.planners.FilePlanner(tmp_path / "answers.jsonl")
 
 
 @pytest.mark.parametrize("name", ["..", "/", "", "a/../b", "x" * 500, "ä ö", ".hidden", "con:stream?*"])

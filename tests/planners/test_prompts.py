@@ -40,9 +40,8 @@ def test_a_continuation_of_a_prompt_is_an_answer(format):
     start = whole.index("    if") if "py" in format else whole.index("- When")
     assert lw.decode_plan(whole[start:], "drawer-open", format).plan.steps[0].condition == plan.steps[0].condition
     if not format.endswith("py_md"):
-        assert lw.decode_plan(
-            lw.planners.plan_prompt("drawer-open", format) + whole[start:], "drawer-open", format
-        ).plan
+        answer = lw.planners.plan_prompt("drawer-open", format) + whole[start:]
+        assert lw.decode_plan(answer, "drawer-open", format).plan
 
 
 def test_the_examples_are_pick_place_and_the_nearest_two():
@@ -69,9 +68,8 @@ def test_the_task_comes_last_in_the_format():
     assert last == "The task `drawer-open`: Take hold of the drawer handle and pull the drawer open."
 
 
-def test_custom_plans_and_tasks(tmp_path):
-    (tmp_path / "tasks.toml").write_text('[stack]\ndescription = "Stack it."\nobjects.brick = "obs[4:7]"\n')
-    tasks = lw.load_tasks(tmp_path / "tasks.toml")
+def test_custom_plans_and_tasks():
+    tasks = {"stack": lw.Task.from_json("stack", {"description": "Stack it.", "objects": {"brick": "obs[4:7]"}})}
     mine = lw.Plans([PLANS["own"]["hammer"]])
     prompt = lw.planners.plan_prompt("stack", "basic_py", plans=mine, tasks=tasks, vocabulary=True)
     assert "def hammer(robot):" in prompt
