@@ -66,7 +66,7 @@ def test_lerobot_datasets_are_imported(tmp_path, version):
     assert (rows["next", "done"] == rows["next", "truncated"]).all()
     replay = lw.LanguageWorldExperienceReplay(made.root, label="executed", batch_size=3)
     assert replay.sample()["next", "reward"].shape == (3, 1)
-    with pytest.raises(ValueError, match="collected by 'imported'; use label='executed'"):
+    with pytest.raises(ValueError, match=".imported. collected the dataset; use label='executed'"):
         lw.LanguageWorldExperienceReplay(made.root, batch_size=3)
     out = lw.export_dataset(made.root, "lerobot", tmp_path / "again")
     assert "NaN" not in (out / "meta" / "stats.json").read_text()
