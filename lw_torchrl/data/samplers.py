@@ -43,15 +43,13 @@ def to_device_of(storage: Storage, index: Tensor) -> Tensor:
 
 
 def column(storage: Storage, key: NestedKey, rows: Tensor | None = None) -> Tensor:
-    """Return the value (R,) of a column in all rows, or in the given rows, on the CPU.
+    """Return the value (R,) of a column in all rows, or in the given rows, on the CPU; raise KeyError if it is missing.
 
     A row may store its value in any shape, for example (1,), or (T,) with equal entries if rows are trajectory slices.
     """
     data = storage.get(slice(0, len(storage)))
-    leaves = [row.get(key, None) for row in data] if isinstance(data, list) else [data.get(key, None)]
-    if any(leaf is None for leaf in leaves):
-        raise KeyError(f"the storage has no column {key!r} to group rows by")
-    values = (torch.stack(leaves) if isinstance(data, list) else leaves[0]).flatten(0, storage.ndim - 1)
+    values = torch.stack([row[key] for row in data]) if isinstance(data, list) else data[key]
+    values = values.flatten(0, storage.ndim - 1)
     values = (values if rows is None else values[rows.to(values.device)]).cpu()
     if values.dim() == 1:
         return values
@@ -256,15 +254,11 @@ class GroupSampler(Sampler):
     def state_dict(self) -> dict[str, Any]:
         """Return the order and position of each group's pass, and the rows written since the last batch."""
         none = torch.empty(0, dtype=torch.int64)
-        if self._length == 0 or (self._written and self._known is None):  # the next sample groups all rows again
-            passes = [none] * 6
-        else:
-            known = none if self._known is None else self._known
-            written = torch.cat(self._written) if self._written else none
-            passes = [self._order, self._size, self._cursor, self._credit, known, written]
-        length = self._length if len(passes[0]) else 0
-        values = [*(value.clone() for value in passes), torch.tensor(length), torch.tensor(self.ran_out)]
-        return dict(zip(_STATE, values, strict=True))
+        known = none if self._known is None else self._known
+        written = torch.cat(self._written) if self._written else none
+        length = 0 if self._written and self._known is None else self._length  # 0: the next sample groups all rows
+        values = self._order, self._size, self._cursor, self._credit, known, written, length, self.ran_out
+        return {name: torch.as_tensor(value).clone() for name, value in zip(_STATE, values, strict=True)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state; the next sample raises ValueError if the state was saved for other rows."""

@@ -88,13 +88,18 @@ use and whose values are an N or a list of episode indices.
 """
 
 
+def episodes_by_task(dataset: Demonstrations) -> dict[str, list[int]]:
+    existing: dict[str, list[int]] = {}
+    for episode in dataset.episodes:
+        existing.setdefault(episode.task, []).append(episode.episode)
+    return existing
+
+
 def choose_episodes(dataset: Demonstrations, choice: EpisodeChoice, argument: str = "episodes") -> Demonstrations:
     """Return a dataset's description with only the chosen episodes, in the order of the dataset."""
     if choice is None:
         return dataset
-    existing: dict[str, list[int]] = {}
-    for episode in dataset.episodes:
-        existing.setdefault(episode.task, []).append(episode.episode)
+    existing = episodes_by_task(dataset)
     choices = choice if isinstance(choice, Mapping) else dict.fromkeys(existing, choice)
     if not choices:
         raise ValueError(f"{argument} must choose at least one episode, got {shown(choice)}")
@@ -209,9 +214,5 @@ class JoinedDemonstrations:
 
     @property
     def config(self) -> JoinedConfig:
-        chosen: list[dict[str, list[int]]] = []
-        for part in self.parts:
-            chosen.append({})
-            for episode in part.episodes:
-                chosen[-1].setdefault(episode.task, []).append(episode.episode)
-        return JoinedConfig(tuple(part.config for part in self.parts), tuple(chosen))
+        chosen = tuple(episodes_by_task(part) for part in self.parts)
+        return JoinedConfig(tuple(part.config for part in self.parts), chosen)

@@ -98,7 +98,7 @@ def test_actions_beyond_one_are_clipped(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"action": None}, "column 'action' needs 4 numbers"),
+        ({"action": None}, "column 'action' needs 4 numbers per row"),
         (
             {"observation.environment_state": None},
             r"column 'observation' needs 39 .* observation.state \(4\)",
