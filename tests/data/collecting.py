@@ -38,6 +38,22 @@ def collect(root, tasks=TASKS, **changed):
     return collect_demonstrations(tasks, root=root, **{**options, **changed})
 
 
+KINDS = {
+    "expert": {},
+    "unclipped": dict(label="unclipped"),
+    "executed": dict(label="executed", reward="dense"),
+    "cut": dict(label="executed", after_success=3),
+    "chosen": dict(episodes=2),
+    "n steps": dict(label="executed", n_steps=3, gamma=0.9),
+}
+
+
+def open_replay(root, kind="expert", seed=0, **options):
+    generator = torch.Generator().manual_seed(seed)
+    defaults = dict(batch_size=8, generator=generator)
+    return lw.LanguageWorldExperienceReplay(root, **{**defaults, **KINDS[kind], **options})
+
+
 def tree(root):
     """Every file below a folder with its bytes."""
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
