@@ -189,7 +189,7 @@ def test_assigning_rows_is_an_error(dataset, kind):
         replay.empty,
         storage._empty,
     ):
-        with pytest.raises(RuntimeError, match="read-only|doesn't allow writing|generation"):
+        with pytest.raises(RuntimeError, match=r"read-only|doesn't allow writing|generation"):
             write()
     assert tree(dataset.root) == before
     assert (replay[:] == rows).all()

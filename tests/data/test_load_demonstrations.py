@@ -1,8 +1,10 @@
 """load_demonstrations: rows for TorchRL's tools."""
 
+import functools
+
 import pytest
 import torch
-from collecting import tree
+from collecting import open_replay, tree
 from tensordict import TensorDict
 from torchrl.data import (
     LazyTensorStorage,
@@ -22,10 +24,6 @@ from lw_torchrl.data.dataset import MappedColumn
 @pytest.fixture
 def roots(dataset, other_dataset):
     return [dataset.root, other_dataset.root]
-
-
-def open_replay(roots, **options):
-    return lw.LanguageWorldExperienceReplay(roots[0], **{"label": "executed", "batch_size": 8, **options})
 
 
 def test_rows_of_one_folder_stay_in_its_files_and_changes_stay_in_memory(roots):
@@ -52,26 +50,23 @@ def double(batch):
 
 
 def test_transforms_may_be_functions_and_samplers_factories(roots):
-    appended = open_replay(roots)
+    opened = functools.partial(open_replay, roots[0])
+    appended = opened()
     appended.append_transform(double)
-    for replay in (open_replay(roots, transform=double), open_replay(roots, transform=double, sampler=RandomSampler)):
+    for replay in (appended, opened(transform=double), opened(transform=double, sampler=RandomSampler)):
         batch = replay.sample()
         assert torch.equal(batch["twice"], 2 * batch["action"])
         assert "twice" in replay[:].keys()
         assert "twice" not in replay.storage[:].keys()
-    assert "twice" in appended.sample().keys()
-    shared = TensorDictReplayBuffer(storage=open_replay(roots).storage, batch_size=5)
+    shared = TensorDictReplayBuffer(storage=opened().storage, batch_size=5)
     assert shared.sample().shape == (5,)
 
 
 @pytest.mark.filterwarnings("ignore:Got conflicting batch_sizes")
 def test_torchrls_tools_draw_batches_of_any_size(roots):
-    replay = open_replay(roots, sampler=lw.TaskBalancedSampler())
-    assert replay.sample(1).shape == (1,)
+    replay = open_replay(roots[0], sampler=lw.TaskBalancedSampler())
     filled = prefill_replay_buffer(TensorDictReplayBuffer(storage=LazyTensorStorage(200)), replay, n_samples=51)
     assert len(filled) == 51
-    with pytest.raises(ValueError, match="batch_size"):
-        open_replay(roots, sampler=lw.TaskBalancedSampler(exact=True)).sample(1)
 
 
 @pytest.fixture(scope="module")
@@ -87,8 +82,8 @@ def rollout():
 @pytest.mark.parametrize("n_steps", [1, 3])
 def test_rows_join_with_rollouts_of_the_environment(roots, rollout, n_steps):
     ahead = {"n_steps": n_steps, "gamma": 0.9} if n_steps > 1 else {}
-    sampler, plans = lw.TaskBalancedSampler(), lw.load_plans("MT10")
-    offline = open_replay(roots, keys="rollout", sampler=sampler, transform=lw.QAFTransform(plans), **ahead)
+    options = {"sampler": lw.TaskBalancedSampler(), "transform": lw.QAFTransform(lw.load_plans("MT10"))}
+    offline = open_replay(roots[0], "executed", keys="rollout", **options, **ahead)
     keys = offline.sample(1).keys(True, True)
     rows = lw.data.n_step_returns(rollout, 3, 0.9) if ahead else rollout
     assert set(ROLLOUT) <= set(keys) <= set(rows.keys(True, True))
