@@ -156,6 +156,8 @@ def test_other_files_are_errors_with_the_path(made, tmp_path):
     (tmp_path / "old" / "meta" / "info.json").write_text('{"codebase_version": "v1.6", "features": {}}')
     with pytest.raises(ExchangeError, match=r"'v1\.6'"):
         lw.import_dataset(tmp_path / "old", tmp_path / "out")
+    with pytest.raises(FileNotFoundError, match="source"):
+        lw.import_dataset(tmp_path / "nowhere", tmp_path / "out")
     with pytest.raises(ValueError, match="out must be a new folder"):
         lw.export_dataset(made.root, "lerobot", tmp_path)
     assert not (tmp_path / "out").exists()
@@ -189,7 +191,7 @@ import huggingface_hub
 root, work = sys.argv[1:]
 dataset = LeRobotDataset("mine/demos", root=root)
 rows = [dataset[place] for place in range(len(dataset))]
-names = ["observation.state", "next.observation", "action", "expert_action", "next.reward", "next.reward_sparse"]
+names = ["observation.state", "next.observation", "action", "expert_action", "next.reward"]
 read = {name: hashlib.sha256(b"".join(row[name].numpy().tobytes() for row in rows)).hexdigest() for name in names}
 read["task"] = [row["task"] for row in rows]
 read["success"] = [bool(row["next.success"]) for row in rows]

@@ -265,16 +265,3 @@ def test_maniskill_files_are_imported(tmp_path):
     rows = load_rows(imported(tmp_path, tmp_path / "out", "lacks success", episodes_per_task=3))
     assert rows["next", "reward_dense"].flatten()[::9].tolist() == [2.0, 4.0, 12.0]
     assert_equal(rows["next", "observation"][:9], np.resize(STATES, (10, 39))[1:])
-
-
-def test_limits_of_the_system_are_not_called_damage(tmp_path, monkeypatch):
-    from lw_torchrl.data import dataset
-
-    made = imported(flat(tmp_path / "a.parquet"), tmp_path / "out", "lacks", episodes_per_task=2)
-
-    def no_files(*_):
-        raise OSError(24, "Too many open files")
-
-    monkeypatch.setattr(dataset.np, "memmap", no_files)
-    with pytest.raises(OSError, match="Too many open files"):
-        load_rows(made)

@@ -1,7 +1,6 @@
 """Pictures of datasets: equal to a camera's, lossless, resumed after a kill, and errors for damaged ones."""
 
 import shutil
-import zipfile
 
 import pytest
 import torch
@@ -80,7 +79,6 @@ def test_rows_between_pictures_have_the_earlier_one(root):
     each, held = load(replay), load(replay, every=7)
     step = torch.cat([torch.arange(info.length) for info in replay.demonstrations.episodes])
     assert torch.equal(held, each[torch.arange(len(each)) - step % 7])
-    assert sum(len(zipfile.ZipFile(file).namelist()) for file in files(root)[:1]) in (2, 12)
 
 
 @pytest.mark.slow

@@ -36,8 +36,6 @@ def test_a_transform_answers_the_plans_queries(dataset, label):
     replay = open_replay(dataset.root, batch_size=32, label=label, transform=lw.QAFTransform(PLANS))
     batch = replay.sample()
     program = QueryProgram({task: [step.condition for step in plan.steps] for task, plan in PLANS.items()})
-    assert batch["qaf"].dtype == torch.bool
-    assert batch["qaf"].shape == (32, PLANS.num_steps)
     assert torch.equal(batch["qaf"], program(batch["observation"], batch["task_id"]))
     assert (("next", "qaf") in batch.keys(True)) == (label == "executed")
     if label == "executed":
@@ -107,23 +105,19 @@ def test_an_inverse_transform_changes_samples(dataset):
 
 @pytest.fixture(scope="module")
 def ending(tmp_path_factory):
-    """Episodes that succeed within 90 steps, opened with their ends at success."""
+    """Two demonstrations each of push and reach, which succeed within 90 steps."""
     root = tmp_path_factory.mktemp("ending") / "demos"
-    collect(root, episodes_per_task=2, seed=0, noise_scale=0.1, max_steps=90)
-    return lambda **options: LanguageWorldExperienceReplay(
-        root, label="executed", **{"terminate_on_success": True, **options}
-    )
+    return collect(root, episodes_per_task=2, seed=0, noise_scale=0.1, max_steps=90)
 
 
 def test_episodes_end_as_in_an_environment_that_ends_at_success(ending):
     """The executed actions lead to the same states in such an environment."""
-    replay, whole = ending(), ending(terminate_on_success=False)
-    rows, episodes = replay[:], replay.demonstrations.episodes
-    assert any(episode.success for episode in episodes)
-    for number, episode in enumerate(episodes):
+    rows = open_replay(ending.root, label="executed", terminate_on_success=True)[:]
+    assert any(episode.success for episode in ending.episodes)
+    for number, episode in enumerate(ending.episodes):
         env = lw.LanguageWorldEnv(episode.task, seed=0, max_steps=90, terminate_on_success=True)
         state, states = env.reset(episode=episode.episode), []
-        for action in whole[episode.start : episode.start + episode.length]["action"]:
+        for action in load_rows(ending)["action"][episode.start : episode.start + episode.length]:
             state = env.step(state.set("action", action.unsqueeze(0)))["next"]
             states.append(state.clone())
             if state["done"].any():
@@ -134,10 +128,11 @@ def test_episodes_end_as_in_an_environment_that_ends_at_success(ending):
             assert torch.equal(of_episode["next", key], expected[key]), (episode, key)
 
 
-def test_n_step_returns_terminate_at_success(ending):
-    rows = ending(n_steps=5, gamma=0.99)[:]
-    assert torch.equal(rows["next", "terminated"], rows["next", "success"])
-    assert (rows["next", "reward"][rows["next", "terminated"]] > 0).all()
+@pytest.mark.parametrize("ends", [dict(), dict(after_success=4), dict(terminate_on_success=True)])
+def test_n_steps_end_with_the_episode(ending, ends):
+    rows, ahead = (open_replay(ending.root, kind, reward="dense", **ends)[:] for kind in ("executed", "n steps"))
+    assert (ahead == lw.data.n_step_returns(rows, 3, 0.9)).all()
+    assert ahead["next", "done"].sum() == 3 * len(ending.episodes)
 
 
 # ---- the saved state
@@ -265,22 +260,12 @@ def test_values_of_other_rows_are_errors(both):
 
 # ---- several datasets and chosen episodes
 
-STEPS = 50
-
-
-@pytest.fixture(scope="module")
-def base(tmp_path_factory):
-    """Two demonstrations each of button-press-topdown, push and reach."""
-    tasks = ["reach", "push", "button-press-topdown"]
-    root = tmp_path_factory.mktemp("made") / "base"
-    return collect(root, tasks, episodes_per_task=2, seed=0, max_steps=STEPS, noise_scale=(0, 0.3))
-
 
 @pytest.fixture(scope="module")
 def target(tmp_path_factory):
     """Four demonstrations of reach, with another seed."""
     root = tmp_path_factory.mktemp("made") / "target"
-    dataset = collect(root, "reach", episodes_per_task=4, seed=1, max_steps=STEPS, noise_scale=(0, 0.2))
+    dataset = collect(root, "reach", episodes_per_task=4, seed=1, max_steps=50, noise_scale=(0, 0.2))
     assert {e.success for e in dataset.episodes} == {True, False}, "the tests need successes and failures"
     return dataset
 
@@ -303,58 +288,53 @@ def expected_rows(part, episodes, after=None):
 
 @pytest.mark.parametrize("label", ["expert", "unclipped", "executed"])
 @pytest.mark.parametrize("after", [None, 0, 5, 20])
-def test_rows_are_those_of_each_dataset(base, target, label, after):
-    replay = LanguageWorldExperienceReplay(
-        [base.root, target.root], episodes=[None, {"reach": [1, 3]}], label=label, after_success=after
-    )
-    first, first_ends = expected_rows(base, None, after)
+def test_rows_are_those_of_each_dataset(ending, target, label, after):
+    roots, episodes = [ending.root, target.root], [None, {"reach": [1, 3]}]
+    replay = open_replay(roots, episodes=episodes, label=label, after_success=after)
+    first, first_ends = expected_rows(ending, None, after)
     second, second_ends = expected_rows(target, [("reach", 1), ("reach", 3)], after)
-    second.set(("collector", "traj_ids"), second["collector", "traj_ids"] + 6)
+    second.set(("collector", "traj_ids"), second["collector", "traj_ids"] + 4)
     expected = torch.cat([first, second])
     if label != "executed":
         expected["action"] = expected[f"{label}_action"]
         expected = expected.exclude("next", "expert_action", "unclipped_action")
     else:
         expected["next", "reward"] = expected["next", "reward_sparse"]
-        ends = torch.cat([first_ends, second_ends])
-        expected["next", "done"] = expected["next", "truncated"] = ends
+        expected["next", "done"] = expected["next", "truncated"] = torch.cat([first_ends, second_ends])
     expected["behaviour"] = torch.zeros(len(expected), dtype=torch.int64)
     expected["dataset"] = torch.tensor([0] * len(first) + [1] * len(second))
     expected["is_demonstration"] = torch.ones(len(expected), dtype=torch.bool)
-    rows = replay[:]
-    assert len(replay) == len(expected)
     assert replay.behaviours == ("noisy",)
-    assert set(rows.keys(True, True)) == set(expected.keys(True, True))
-    assert (rows == expected).all()
-    assert rows.device == LanguageWorldExperienceReplay(base.root)[:].device
+    assert set(replay[:].keys(True, True)) == set(expected.keys(True, True))
+    assert (replay[:] == expected).all()
 
 
 @pytest.mark.parametrize(
     ("choice", "episodes"),
     [
-        (1, [("button-press-topdown", 0), ("push", 0), ("reach", 0)]),
+        (1, [("push", 0), ("reach", 0)]),
         ({"reach": 1}, [("reach", 0)]),
         ({"reach": [1], "push": 2}, [("push", 0), ("push", 1), ("reach", 1)]),
         ({"reach": (1, 0)}, [("reach", 0), ("reach", 1)]),
     ],
 )
-def test_episodes_are_chosen_from_one_dataset(base, choice, episodes):
-    replay = LanguageWorldExperienceReplay(base.root, episodes=choice, label="executed")
+def test_episodes_are_chosen_from_one_dataset(ending, choice, episodes):
+    replay = open_replay(ending.root, episodes=choice, label="executed")
     assert [(e.task, e.episode) for e in replay.demonstrations.episodes] == episodes
     rows = replay[:].exclude("behaviour", "is_demonstration", ("next", "reward"))
-    assert (rows == expected_rows(base, episodes)[0]).all()
+    assert (rows == expected_rows(ending, episodes)[0]).all()
     assert replay.tasks == tuple(sorted({task for task, _ in episodes}))
-    assert replay.demonstrations.num_steps == len(replay) == STEPS * len(episodes)
-    assert replay.data_path_root == base.root
+    assert replay.demonstrations.num_steps == len(replay) == 90 * len(episodes)
+    assert replay.data_path_root == ending.root
 
 
-def test_the_description_names_datasets_and_episodes(base, target):
-    replay = LanguageWorldExperienceReplay([base.root, str(target.root)], episodes=[1, {"reach": [2, 0]}])
+def test_the_description_names_datasets_and_episodes(ending, target):
+    replay = open_replay([ending.root, str(target.root)], episodes=[1, {"reach": [2, 0]}])
     joined = replay.demonstrations
     assert isinstance(joined, JoinedDemonstrations)
-    assert [part.root for part in joined.parts] == list(replay.roots) == [base.root, target.root]
-    assert joined.config.episodes == ({"button-press-topdown": [0], "push": [0], "reach": [0]}, {"reach": [0, 2]})
-    assert json.loads(json.dumps(joined.config.to_json()))["parts"][0] == base.config.to_json()
+    assert [part.root for part in joined.parts] == list(replay.roots) == [ending.root, target.root]
+    assert joined.config.episodes == ({"push": [0], "reach": [0]}, {"reach": [0, 2]})
+    assert json.loads(json.dumps(joined.config.to_json()))["parts"][0] == ending.config.to_json()
     for path in ("data_path_root", "data_path"):
         with pytest.raises(ValueError, match="joins 2 datasets"):
             getattr(replay, path)

@@ -97,7 +97,7 @@ def find_ends(table: ImportedTable, suite: Suite, episode_length: int | None) ->
     limit, lengths, tasks, is_cut = episode_length or suite.max_steps, [], [], False
     for (start, end), task in zip(table.spans(), table.tasks, strict=True):
         inner = np.flatnonzero(marks[start:end]) + 1 + start
-        parts = [part for part in pairwise(np.unique([start, *inner, end]).tolist())]
+        parts = [*pairwise(np.unique([start, *inner, end]).tolist())]
         for first, last in parts:
             if len(parts) == 1 and (last - first) % limit and (last - first > limit or episode_length is not None):
                 rows = f"{last - first} rows, because the files do not state where episodes end"

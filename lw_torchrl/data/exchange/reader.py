@@ -90,10 +90,8 @@ class Files:
     """The episodes that :func:`read_parquet` or :func:`read_hdf5` reads, and the columns to read."""
 
     def __init__(self, widths: Mapping[str, int], allowed: int) -> None:
-        self.widths, self.allowed = (
-            widths,
-            allowed,
-        )  # the values per row of each column; the bytes that may still be read
+        self.widths = widths  # the number of values per row of each column to read
+        self.allowed = allowed  # the number of bytes that may still be read
         self.columns: dict[str, Array] = {}
         self.sources: dict[str, str] = {}  # for each column that was read, its name in the files
         self.unfit: dict[str, str] = {}  # for each column whose size does not fit, its name in the files
