@@ -46,6 +46,7 @@ _STORED = [key for key in COLUMNS if key != TRAJECTORY]
 _RECORDED = [key for key in _STORED if not key[-1].startswith("reward")] + [("next", "reward")]
 _FAILED = b"FAILED"  # the file content that marks a failed episode, which is replaced by another episode
 _ROWS = 64  # environments stepped together; with more, an interruption would lose more work
+_INSTEAD = "choose another folder, or delete this folder to start again"
 _MAX_ATTEMPTS = 20  # number of episodes to run per kept episode before redrawing gives up
 
 _Actor = Callable[[TensorDictBase], TensorDictBase]
@@ -99,10 +100,8 @@ def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[
             candidate += 1
         missing = config.episodes_per_task - len(kept[task])
         if missing and candidate >= config.episodes_per_task * _MAX_ATTEMPTS:
-            raise RuntimeError(
-                f"task {task!r}: only {len(kept[task])} of {candidate} episodes of {config.behaviour!r} succeeded; "
-                "lower noise_scale, or set redraw_failures=False"
-            )
+            problem = f"task {task!r}: only {len(kept[task])} of {candidate} episodes of {config.behaviour!r} succeeded"
+            raise RuntimeError(f"{problem}; lower noise_scale, or set redraw_failures=False")
         ahead = range(candidate, candidate + missing)
         if listed := [episode for episode in ahead if not files.has(task, episode)]:
             wanted[task] = listed
@@ -201,21 +200,16 @@ def _begin(root: Path, config: CollectConfig) -> dict[str, str]:
         return versions
     begun = read_json(path, "root: the file")
     _check_same(CollectConfig.from_json(begun["config"]), config, root)
-    if changes := version_changes(begun["versions"], SIMULATORS):
-        raise DatasetError(
-            f"root: {str(root)!r} holds episodes of another simulator ({'; '.join(changes)}); install that version, "
-            "choose another folder, or delete this folder to start again"
-        )
+    if changes := "; ".join(version_changes(begun["versions"], SIMULATORS)):
+        raise DatasetError(f"root: {str(root)!r} holds episodes of another simulator ({changes}); {_INSTEAD}")
     return begun["versions"]
 
 
 def _check_same(before: CollectConfig, config: CollectConfig, root: Path) -> None:
     if before != config:
         was, now = (each.to_json() | {"policy": each.policy.to_json()} for each in (before, config))
-        raise DatasetError(
-            f"root: {str(root)!r} holds a dataset with another configuration ({', '.join(differences(was, now))}); "
-            "choose another folder, or delete this folder to start again"
-        )
+        changes = ", ".join(differences(was, now))
+        raise DatasetError(f"root: {str(root)!r} holds a dataset with another configuration ({changes}); {_INSTEAD}")
 
 
 def _assemble(
@@ -337,15 +331,12 @@ def collect_demonstrations(
         policy=behaviour_of(policy, names, behaviour, suite),
     )
     folder, partial = Path(root), Path(root, dataset.PARTIAL)
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"root must be a folder, got the file {str(folder)!r}")
     if (demonstrations := _finished(folder, config)) is not None and not partial.is_dir():
         return demonstrations
-    is_new = demonstrations is None and folder.is_dir() and not partial.is_dir()
-    if is_new and {path.name for path in folder.iterdir()} - {dataset.LOCK}:
+    is_new = demonstrations is None and folder.exists() and not partial.is_dir()
+    if is_new and (not folder.is_dir() or {path.name for path in folder.iterdir()} - {dataset.LOCK}):
         raise DatasetError(f"root: {str(folder)!r} is not empty, but holds no dataset; choose another folder")
-    lock = locked(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
-    with lock:
+    with locked(folder, "root", "collect_demonstrations", folder=True, error=DatasetError):
         if _finished(folder, config) is None:  # another process may have finished the dataset in the meantime
             versions, files = _begin(folder, config), EpisodeFiles(partial)
             kept = run_missing_episodes(config, actor, files, num_envs, suite, progress, workers)

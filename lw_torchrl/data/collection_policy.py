@@ -87,12 +87,6 @@ others), "wrong" (only random skills of the plan) and "random" (random actions i
 """
 
 
-def check_own_label(behaviour: Behaviour) -> None:
-    """Raise :class:`ValueError` if a behaviour's name is reserved for another behaviour."""
-    if behaviour.name == NOISY or behaviour.acts != BEHAVIOURS.get(behaviour.name, behaviour.acts):
-        raise ValueError(f"name {behaviour.name!r} is reserved (reserved: {', '.join((*BEHAVIOURS, NOISY))})")
-
-
 def segment_plans(tasks: Iterable[str], suite: str | Suite = "metaworld") -> Plans:
     """Return the suite's plans for tasks; raise ValueError if the suite has no plans."""
     suite, tasks = load_suite(suite), list(tasks)
@@ -112,21 +106,16 @@ def behaviour_of(
         if not isinstance(policy, nn.Module):
             return Behaviour(name, "policy")
         if draws(policy):
-            raise ValueError(
-                f"policy: this {type(policy).__name__} is stochastic and draws random numbers at each call, so the "
-                "episodes would depend on num_envs and on interruptions; use a deterministic policy"
-            )
+            problem = f"policy: {type(policy).__name__} draws random numbers, so episodes would depend on num_envs"
+            raise ValueError(f"{problem} and interruptions; use a deterministic policy")
         return Behaviour(name, "policy", fingerprint=policy_fingerprint(policy))
     if isinstance(policy, str):
         policy = BEHAVIOURS[check_choice("policy", policy, BEHAVIOURS)]
-    if not isinstance(policy, Behaviour):
-        raise TypeError(f"policy must be a name, a Behaviour, a module or a function, got {type(policy).__name__}")
-    if policy.kind in ("policy", "imported"):
-        raise ValueError(f"policy: the Behaviour {policy.name!r} only describes a policy; pass the policy itself")
-    behaviour = policy
-    if behaviour.kind == "segments":
-        behaviour = replace(behaviour, fingerprint=segment_plans(tasks, suite).fingerprint)
-    return behaviour if name is None else replace(behaviour, name=name)
+    if not isinstance(policy, Behaviour) or policy.kind in ("policy", "imported"):
+        raise ValueError(f"policy must be a name, a Behaviour of segments, a module or a function, got {shown(policy)}")
+    if policy.kind == "segments":
+        policy = replace(policy, fingerprint=segment_plans(tasks, suite).fingerprint)
+    return policy if name is None else replace(policy, name=name)
 
 
 def policy_fingerprint(policy: nn.Module) -> str:

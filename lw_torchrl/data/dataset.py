@@ -33,7 +33,7 @@ from lw_torchrl._util.checks import Count, Scale, typed_fields
 from lw_torchrl._util.files import AnyPath, check_damage, flush, read_json, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl._util.registry import ReadOnlyDict
-from lw_torchrl.data.collection_policy import EXPERT, NOISY, Behaviour, check_own_label
+from lw_torchrl.data.collection_policy import BEHAVIOURS, EXPERT, NOISY, Behaviour
 from lw_torchrl.envs.episodes import first_success
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.tasks import resolve_tasks
@@ -68,7 +68,9 @@ class CollectConfig:
     layout: Layout = METAWORLD
 
     def __post_init__(self) -> None:
-        check_own_label(self.policy)
+        name, acts = self.policy.name, self.policy.acts
+        if name == NOISY or acts != BEHAVIOURS.get(name, acts):
+            raise ValueError(f"behaviour: name {name!r} is reserved (reserved: {', '.join((*BEHAVIOURS, NOISY))})")
         if not self.noise_scale:
             raise ValueError("noise_scale must hold at least one number, got an empty sequence")
         if self.layout == METAWORLD:
@@ -170,12 +172,10 @@ def read_metadata(root: AnyPath) -> Demonstrations:
     path = folder / METADATA
     if not folder.is_dir():
         raise FileNotFoundError(f"root: no dataset folder {str(folder)!r}; create it with collect_demonstrations")
-    if not path.is_file() and (folder / PARTIAL).is_dir():
-        raise DatasetError(
-            f"root: the dataset in {str(folder)!r} is unfinished; repeat the call of collect_demonstrations to resume"
-        )
     if not path.is_file():
-        raise DatasetError(f"root: {str(folder)!r} is not a dataset, because it has no file {METADATA}")
+        resume = "unfinished; repeat the call of collect_demonstrations to resume"
+        problem = resume if (folder / PARTIAL).is_dir() else f"not a dataset, because it has no file {METADATA}"
+        raise DatasetError(f"root: {str(folder)!r} is {problem}")
     try:
         return parse_metadata(read_json(path, "root: the metadata"), folder)
     except DatasetError:
@@ -190,16 +190,11 @@ def damaged(problem: str) -> DatasetError:
 
 
 def parse_metadata(metadata: Mapping[str, Any], folder: Path) -> Demonstrations:
-    """Parse a dataset's metadata.
-
-    Raise DatasetError if the version differs; corrupted metadata may raise any exception.
-    """
+    """Parse a dataset's metadata; raise DatasetError if the version differs, and any exception if it is corrupted."""
     if (metadata["format"], metadata["version"]) != (FORMAT, FORMAT_VERSION):
         version = f"{short(metadata['format'])} version {short(metadata['version'])}"
-        raise DatasetError(
-            f"root: {str(folder)!r} has format {version}, but this package reads {FORMAT!r} version "
-            f"{FORMAT_VERSION}; collect the dataset again"
-        )
+        needed = f"this package reads {FORMAT!r} version {FORMAT_VERSION}"
+        raise DatasetError(f"root: {str(folder)!r} has format {version}, but {needed}; collect the dataset again")
     config = CollectConfig.from_json(metadata["config"])
     columns = [metadata["episodes"][name] for name in EpisodeInfo.__dataclass_fields__]
     episodes = tuple(EpisodeInfo(*row) for row in zip(*columns, strict=True))
@@ -207,7 +202,7 @@ def parse_metadata(metadata: Mapping[str, Any], folder: Path) -> Demonstrations:
     start = 0
     for task, episode in zip(tasks, episodes, strict=True):
         if (episode.task, episode.start) != (task, start) or not 0 < episode.length <= config.max_steps:
-            raise ValueError(f"episode {episode.episode} of {episode.task!r} has the wrong task, start or length")
+            raise ValueError(f"{episode} has the wrong task, start or length")
         start += episode.length
     task_ids = {task: int(metadata["task_ids"][task]) for task in config.tasks}
     return Demonstrations(folder, config, metadata["versions"], task_ids, episodes, metadata["attempts"])

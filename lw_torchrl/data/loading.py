@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict
@@ -65,41 +65,35 @@ def _choose_keys(rows: TensorDict, keys: Keys) -> TensorDict:
     return rows.select(*chosen)
 
 
-def check_options(
-    label: Label, after_success: int | None, terminate_on_success: bool, n_steps: int, gamma: float | None, keys: Any
-) -> None:
-    """Raise :class:`ValueError` for options that contradict or require each other."""
-    if n_steps > 1 and gamma is None:
-        raise ValueError(f"n_steps={n_steps} requires gamma, the loss's discount factor")
-    if n_steps == 1 and gamma is not None:
-        raise ValueError(f"gamma={gamma!r} requires n_steps of at least 2, got 1")
-    if (n_steps > 1 or terminate_on_success or keys == "rollout") and label != "executed":
-        raise ValueError(f"n_steps, terminate_on_success and keys='rollout' require label='executed', got {label!r}")
-    if terminate_on_success and after_success is not None:
-        raise ValueError("terminate_on_success already ends episodes at success; leave out after_success")
-
-
-def labels_of(datasets: Sequence[Demonstrations]) -> tuple[str, ...]:
-    """Return the sorted labels of the collection policies."""
-    return tuple(sorted({dataset.config.behaviour for dataset in datasets}))
-
-
-def read_rows(
-    datasets: Sequence[Demonstrations],
-    parts: Sequence[Demonstrations],
+def select_and_read(
+    root: AnyPath | Iterable[AnyPath],
+    episodes: EpisodeChoice | Sequence[EpisodeChoice],
+    keep: EpisodeFilter | None,
     label: Label,
     reward: RewardName,
-    after: int | None,
-    terminate: bool,
+    after_success: int | None,
+    terminate_on_success: bool,
     n_steps: int,
     gamma: float | None,
     keys: Keys | None,
     device: str | torch.device | None,
-) -> TensorDict:
-    """Read the rows of the selected episodes of datasets; see :func:`load_demonstrations`."""
-    labels, rows_of_parts, trajectories = labels_of(datasets), [], 0
+    check: bool,
+) -> tuple[list[Demonstrations], tuple[str, ...], TensorDict]:
+    """Return the selected part of each dataset, the sorted labels of the collection policies, and the rows.
+
+    See :func:`load_demonstrations` for the arguments.
+    """
+    if (n_steps > 1) != (gamma is not None):
+        raise ValueError(f"n_steps above 1 and gamma require each other, got n_steps={n_steps} and gamma={gamma}")
+    if (n_steps > 1 or terminate_on_success or keys == "rollout") and label != "executed":
+        raise ValueError(f"n_steps, terminate_on_success and keys='rollout' require label='executed', got {label!r}")
+    if terminate_on_success and after_success is not None:
+        raise ValueError("terminate_on_success already ends episodes at success; leave out after_success")
+    after = 0 if terminate_on_success else after_success
+    datasets, parts = select(root, episodes, keep, label, reward, after, check)
+    labels, rows_of_parts, trajectories = sorted({each.config.behaviour for each in datasets}), [], 0
     for number, (dataset, part) in enumerate(zip(datasets, parts, strict=True)):
-        rows = _read_part(dataset, part, label, reward, after, terminate)
+        rows = _read_part(dataset, part, label, reward, after, terminate_on_success)
         rows.set("behaviour", torch.full(rows.batch_size, labels.index(dataset.config.behaviour)))
         rows.set("is_demonstration", torch.ones(rows.batch_size, dtype=torch.bool))
         if len(datasets) > 1:
@@ -109,11 +103,10 @@ def read_rows(
         rows_of_parts.append(rows if keys is None or n_steps > 1 else _choose_keys(rows, keys))
         trajectories += len(dataset.episodes)
     rows = rows_of_parts[0] if len(rows_of_parts) == 1 else torch.cat(rows_of_parts)
-    if n_steps > 1:
-        assert gamma is not None
+    if gamma is not None:
         rows = n_step_returns(rows, n_steps, gamma)
         rows = rows if keys is None else _choose_keys(rows, keys if keys != "rollout" else (*ROLLOUT, STEPS))
-    return rows if device is None else rows.to(check_device("device", device))
+    return parts, tuple(labels), rows if device is None else rows.to(check_device("device", device))
 
 
 @typed
@@ -179,7 +172,5 @@ def load_demonstrations(
 
     Source: the datasets in ``torchrl.data.datasets``, which also keep their rows in memory-mapped tensordicts.
     """
-    check_options(label, after_success, terminate_on_success, n_steps, gamma, keys)
-    after = 0 if terminate_on_success else after_success
-    datasets, parts = select(root, episodes, keep, label, reward, after, check)
-    return read_rows(datasets, parts, label, reward, after, terminate_on_success, n_steps, gamma, keys, device)
+    how = label, reward, after_success, terminate_on_success, n_steps, gamma, keys, device, check
+    return select_and_read(root, episodes, keep, *how)[2]

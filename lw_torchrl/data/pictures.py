@@ -110,9 +110,7 @@ def add_pictures(
     demonstrations = dataset.read_metadata(root)
     dataset.verify(demonstrations, demonstrations.episodes)
     rows = dataset.load_rows(demonstrations)
-    missing = [
-        episode for episode in demonstrations.episodes if not pictures.file(demonstrations.root, episode).is_file()
-    ]
+    missing = [each for each in demonstrations.episodes if not pictures.file(demonstrations.root, each).is_file()]
     with Progress("rendering", sum(map(pictures.count, missing)), "picture", show=progress) as bar:
         for task in demonstrations.config.tasks:
             episodes = [episode for episode in missing if episode.task == task]
@@ -140,10 +138,8 @@ def _render(
             stored = rows[starts + torch.minimum(torch.tensor(step), lengths - 1)]
             if not torch.equal(state.get("observation")[active], stored.get("observation")[active]):
                 versions = ", ".join(f"{name} {version}" for name, version in demonstrations.versions.items())
-                raise DatasetError(
-                    f"root: episodes of {task!r} in {str(demonstrations.root)!r} differ from step {step} on when "
-                    f"re-run; install the versions with which they were collected: {versions}"
-                )
+                problem = f"{str(demonstrations.root)!r} differs from step {step} of {task!r} on when re-run"
+                raise DatasetError(f"root: {problem}; install the versions with which it was collected: {versions}")
             if step % pictures.every == 0:
                 for place in active.nonzero().flatten().tolist():
                     images[place].append(state.get("pixels")[place].numpy())

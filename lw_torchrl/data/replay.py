@@ -16,17 +16,17 @@ from torch.utils.data import get_worker_info
 from torchrl.data import ImmutableDatasetWriter, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers.samplers import Sampler, SliceSampler
-from torchrl.envs import Compose, MultiStepTransform, Reward2GoTransform, Transform
+from torchrl.envs import MultiStepTransform, Reward2GoTransform, Transform
 
 from lw_torchrl._util.checks import Count, Natural, Probability, typed
 from lw_torchrl._util.devices import CPU, finite
 from lw_torchrl._util.files import AnyPath, reading
 from lw_torchrl._util.tensor_files import pop_state, read_tensors, write_tensors
 from lw_torchrl.data.dataset import DATA, TRAJECTORY, read_metadata, verify
-from lw_torchrl.data.loading import check_options, labels_of, read_rows
+from lw_torchrl.data.loading import select_and_read
 from lw_torchrl.data.rewards import STEPS, RewardName
 from lw_torchrl.data.samplers import to_device_of
-from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label, select
+from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label
 from lw_torchrl.transforms.qaf import QAFTransform, latches_of_rows
 
 _FILE = "buffer.safetensors"
@@ -34,6 +34,7 @@ _OVER_TIME = {  # TorchRL's transforms that read several time steps of an episod
     *("ActionChunkTransform", "BurnInTransform", "CatFrames", "NextStateReconstructor", "RandomCropTensorDict"),
     *("RewardSum", "TimeMaxPool"),
 }
+_ON_WRITING = {MultiStepTransform: "n_steps and gamma", Reward2GoTransform: "add_column"}  # act when rows are written
 
 
 class DatasetStorage(TensorStorage):
@@ -80,36 +81,21 @@ class DatasetStorage(TensorStorage):
             raise ValueError("state_dict was saved for other rows; open the buffer with the same datasets and options")
 
 
-def _check_transform(transform: Any) -> None:
-    """Raise ValueError for TorchRL transforms that act only when rows are written, so that samples would not change."""
-    if isinstance(transform, Compose):
-        for part in transform:
-            _check_transform(part)
-    elif isinstance(transform, MultiStepTransform):
-        options = f"n_steps={transform.n_steps}, gamma={transform.gamma}"
-        raise ValueError(f"transform: MultiStepTransform does not change samples; use {options} instead")
-    elif isinstance(transform, Reward2GoTransform):
-        raise ValueError("transform: Reward2GoTransform does not change samples; use add_column for reward-to-go")
+def _check_transforms(sampler: Sampler, *transforms: Any) -> None:
+    """Raise ValueError for a transform that acts only when rows are written, or that would mix episodes, because it
+    reads consecutive time steps.
 
-
-def _check_time(sampler: Sampler, *transforms: Any) -> None:
-    """Raise ValueError if a transform reads consecutive time steps, but the rows of a sample are not consecutive.
-
-    A SliceSampler returns flat samples, so an earlier transform must reshape them; otherwise episodes would be mixed.
+    A SliceSampler returns consecutive rows in flat samples, which an earlier transform must reshape.
     """
     is_reshaped = False
     for part in (part for transform in transforms if isinstance(transform, Transform) for part in transform.modules()):
+        if instead := next((hint for kind, hint in _ON_WRITING.items() if isinstance(part, kind)), None):
+            raise ValueError(f"transform: {type(part).__name__} does not change samples; use {instead} instead")
         kinds = {kind.__name__ for kind in type(part).__mro__}
         is_reshaped |= bool(kinds & {"BatchSizeTransform", "_CallableTransform"})
         if (names := kinds & _OVER_TIME) and not (is_reshaped and isinstance(sampler, SliceSampler)):
-            working = 'sampler=SliceSampler(slice_len=16, traj_key=("collector", "traj_ids"))'
-            slices, rows = (
-                f"BatchSizeTransform(reshape_fn=lambda rows: rows.reshape({shape}))" for shape in ("-1, 16", -1)
-            )
-            raise ValueError(
-                f"transform: {names.pop()} reads consecutive time steps, but the rows of a sample come from different "
-                f"episodes; use {working} and transform=Compose({slices}, ..., {rows})"
-            )
+            problem = f"transform: {names.pop()} reads consecutive time steps, but samples mix episodes"
+            raise ValueError(f"{problem}; use sampler=SliceSampler(...) and BatchSizeTransform (see docs/data.md)")
 
 
 class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
@@ -126,8 +112,8 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         sampler: a TorchRL sampler, or a function that creates a sampler, such as :class:`TaskBalancedSampler`; None
             to sample uniformly.
         transform: a TorchRL transform, or any function of a TensorDict, applied to each sample.
-        **kwargs: keyword arguments of :class:`torchrl.data.TensorDictReplayBuffer`, such as generator or pin_memory;
-            prefetch must be 0 or 1, because several threads would draw in an order that differs between runs.
+        prefetch: 1 to draw the next sample in a thread. More threads would draw in an order that differs between runs.
+        **kwargs: keyword arguments of :class:`torchrl.data.TensorDictReplayBuffer`, such as generator or pin_memory.
 
     Attributes:
         demonstrations: the dataset's description; :class:`JoinedDemonstrations` for several folders or a selection.
@@ -158,6 +144,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         episodes: EpisodeChoice | Sequence[EpisodeChoice] = None,
         keep: EpisodeFilter | None = None,
         batch_size: Count | None = None,
+        prefetch: Literal[0, 1] | None = None,
         sampler: Sampler | Callable[[], Sampler] | None = None,
         transform: Transform | Callable[[TensorDictBase], TensorDictBase] | None = None,
         label: Label = "expert",
@@ -171,15 +158,10 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         check: bool = True,
         **kwargs: Any,
     ) -> None:
-        _check_transform(transform)
-        if (prefetch := kwargs.get("prefetch") or 0) > 1:
-            raise ValueError(f"prefetch must be 0 or 1, got {prefetch}: several threads would draw in a random order")
-        check_options(label, after_success, terminate_on_success, n_steps, gamma, keys)
         is_single = isinstance(root, (str, os.PathLike)) and episodes is None and keep is None
-        after = 0 if terminate_on_success else after_success
-        datasets, parts = select(root, episodes, keep, label, reward, after, check)
-        loaded = read_rows(datasets, parts, label, reward, after, terminate_on_success, n_steps, gamma, keys, device)
-        self.parts, self.behaviours = tuple(parts), labels_of(datasets)
+        how = label, reward, after_success, terminate_on_success, n_steps, gamma, keys, device, check
+        parts, self.behaviours, loaded = select_and_read(root, episodes, keep, *how)
+        self.parts = tuple(parts)
         self.demonstrations = parts[0] if is_single else JoinedDemonstrations(self.parts)
         self.roots = tuple(part.root for part in parts)
         self.root = self.roots[0]
@@ -189,9 +171,9 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         rows = [[[e.task, e.episode, e.start, e.length, e.checksum] for e in part.episodes] for part in parts]
         shown = json.dumps([rows, after_success, terminate_on_success])  # identifies the rows in saved states
         storage = DatasetStorage(loaded, sha256(shown.encode()).hexdigest())
-        kwargs |= {"sampler": sampler, "batch_size": batch_size, "transform": transform}
+        kwargs |= {"sampler": sampler, "batch_size": batch_size, "transform": transform, "prefetch": prefetch}
         super().__init__(storage=storage, writer=ImmutableDatasetWriter(), **kwargs)
-        _check_time(self.sampler, self.transform)
+        _check_transforms(self.sampler, self.transform)
         self._add_latches(self.transform)
 
     def sample(self, batch_size: int | None = None, return_info: bool = False, include_info: bool | None = None) -> Any:
@@ -204,13 +186,13 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
     def append_transform(self, transform: Transform, *, invert: bool = False) -> Any:
         """Append a transform. For a :class:`QAFTransform` whose conditions depend on earlier steps, also add the column
         ``qaf_latches`` to the rows."""
-        _check_time(self.sampler, self.transform, transform)
+        _check_transforms(self.sampler, self.transform, transform)
         self._add_latches(transform)
         return super().append_transform(transform, invert=invert)
 
     def insert_transform(self, index: int, transform: Transform, *, invert: bool = False) -> Any:
         """Insert a transform, like :meth:`append_transform`."""
-        _check_time(self.sampler, *self.transform[:index], transform)
+        _check_transforms(self.sampler, *self.transform[:index], transform)
         self._add_latches(transform)
         return super().insert_transform(index, transform, invert=invert)
 
@@ -233,7 +215,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
 
     def set_sampler(self, sampler: Sampler) -> Sampler:
         """Set a sampler, which uses the buffer's generator; in a DataLoader worker, call ``set_rng`` afterwards."""
-        _check_time(sampler, getattr(self, "_transform", None))
+        _check_transforms(sampler, getattr(self, "_transform", None))
         before = super().set_sampler(sampler)
         # The workers of a DataLoader have equal copies of the generator, so all workers would draw the same rows.
         if get_worker_info() is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
+from contextlib import suppress
 from fractions import Fraction
 from functools import reduce
 from math import gcd, isclose
@@ -42,20 +43,17 @@ def to_device_of(storage: Storage, index: Tensor) -> Tensor:
 
 
 def column(storage: Storage, key: NestedKey, rows: Tensor | None = None) -> Tensor:
-    """Return the value (R,) of a column in all rows, or in the given rows, on the CPU.
+    """Return the value (R,) of a column in all rows, or in the given rows, on the CPU; raise KeyError if it is missing.
 
     A row may store its value in any shape, for example (1,), or (T,) with equal entries if rows are trajectory slices.
     """
     data = storage.get(slice(0, len(storage)))
-    leaves = [row.get(key, None) for row in data] if isinstance(data, list) else [data.get(key, None)]
-    if any(leaf is None for leaf in leaves):
-        raise KeyError(f"the storage has no column {key!r} to group rows by")
-    values = (torch.stack(leaves) if isinstance(data, list) else leaves[0]).flatten(0, storage.ndim - 1)
+    values = torch.stack([row[key] for row in data]) if isinstance(data, list) else data[key]
+    values = values.flatten(0, storage.ndim - 1)
     values = (values if rows is None else values[rows.to(values.device)]).cpu()
     if values.dim() == 1:
         return values
-    values = values.flatten(1)
-    if not (values == values[:, :1]).all():
+    if not ((values := values.flatten(1)) == values[:, :1]).all():
         raise ValueError(f"column {key!r} must have one value per row; split the rows that hold several values")
     return values[:, 0]
 
@@ -185,10 +183,8 @@ class GroupSampler(Sampler):
             unit = sum(weights) // divisor
             multiple, rest = divmod(batch_size, unit)
             if rest and self.exact:
-                nearest = " and ".join(str(size) for size in (multiple * unit, (multiple + 1) * unit) if size)
-                raise ValueError(
-                    f"batch_size must be a multiple of {unit}, {reason}, got {batch_size}; the nearest are {nearest}"
-                )
+                near = " and ".join(str(size) for size in (multiple * unit, (multiple + 1) * unit) if size)
+                raise ValueError(f"batch_size must be a multiple of {unit}, {reason}; nearest to {batch_size}: {near}")
             shares = self._rounded(batch_size, unit) if rest else self._weight * multiple
             group = torch.repeat_interleave(shares)
             place = torch.arange(len(group)) - (shares.cumsum(0) - shares)[group]
@@ -220,10 +216,8 @@ class GroupSampler(Sampler):
         """Draw the indices (B,) int64 of a batch, counted along the flattened storage, on the CPU."""
         worker = get_worker_info()
         if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
-            raise RuntimeError(
-                f"all {worker.num_workers} workers of the DataLoader would draw the same rows; in each worker, create "
-                "the buffer again, or call replay.set_sampler(...) and replay.set_rng(...) (see docs/data.md)"
-            )
+            problem = f"all {worker.num_workers} workers of the DataLoader would draw the same rows"
+            raise RuntimeError(f"{problem}; in each worker, open the buffer again or set its sampler and generator")
         if not len(storage):
             raise ValueError("storage must hold at least one row, but it is empty")
         if self._restored and self._length:
@@ -260,15 +254,11 @@ class GroupSampler(Sampler):
     def state_dict(self) -> dict[str, Any]:
         """Return the order and position of each group's pass, and the rows written since the last batch."""
         none = torch.empty(0, dtype=torch.int64)
-        if self._length == 0 or (self._written and self._known is None):  # the next sample groups all rows again
-            passes = [none] * 6
-        else:
-            known = none if self._known is None else self._known
-            written = torch.cat(self._written) if self._written else none
-            passes = [self._order, self._size, self._cursor, self._credit, known, written]
-        length = self._length if len(passes[0]) else 0
-        values = [*(value.clone() for value in passes), torch.tensor(length), torch.tensor(self.ran_out)]
-        return dict(zip(_STATE, values, strict=True))
+        known = none if self._known is None else self._known
+        written = torch.cat(self._written) if self._written else none
+        length = 0 if self._written and self._known is None else self._length  # 0: the next sample groups all rows
+        values = self._order, self._size, self._cursor, self._credit, known, written, length, self.ran_out
+        return {name: torch.as_tensor(value).clone() for name, value in zip(_STATE, values, strict=True)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state; the next sample raises ValueError if the state was saved for other rows."""
@@ -286,13 +276,11 @@ class GroupSampler(Sampler):
             keys = None if self._known is None else self._keys(storage, self._order[old])
             if keys is None or self._known is None or not torch.equal(keys.reshape(-1).cpu(), self._known[groups[old]]):
                 self._length, self._written = 0, []
-        elif length != self._length:
-            raise ValueError(f"state_dict must fit the storage's {length} rows, got a state for {self._length} rows")
         else:
             label = self._label(storage).cpu()
-            rows = (label >= 0).nonzero().flatten()
-            if not torch.equal(self._order.sort().values, rows) or not torch.equal(label[self._order], groups):
-                raise ValueError("state_dict must fit the storage's rows, got a state whose groups differ")
+            same_rows = torch.equal(self._order.sort().values, (label >= 0).nonzero().flatten())
+            if length != self._length or not same_rows or not torch.equal(label[self._order], groups):
+                raise ValueError("state_dict must fit the storage's rows, got a state for other rows")
         self._restored = False
 
     def dumps(self, path: AnyPath) -> None:
@@ -408,16 +396,11 @@ class CoLearningSampler(GroupSampler):
     def _label(self, storage: Storage) -> Tensor:
         task = column(storage, self.task_key)
         is_target, is_base = task == self._target_id, task != self._target_id
-        if not is_target.any():
+        if not is_target.any() or not is_base.any():
             tasks = ", ".join(MT50[i] if 0 <= i < len(MT50) else str(i) for i in task.unique().tolist())
-            raise ValueError(f"target: the storage has no row of {self.target!r}; its tasks are {tasks}")
-        if not is_base.any():
-            raise ValueError("target: the storage has rows of the target only; add rows of base tasks")
-        try:
+            raise ValueError(f"target: the storage must have rows of {self.target!r} and of other tasks, got {tasks}")
+        with suppress(KeyError):  # the rows come from one dataset
             dataset = column(storage, DATASET)
-        except KeyError:  # the rows come from one dataset
-            pass
-        else:
             is_target &= dataset == dataset[is_target].max()
         label = torch.where(is_target, 0, -1)
         label[is_base] = 1 + torch.unique(task[is_base], return_inverse=True)[1]
@@ -453,7 +436,5 @@ class CoLearningSampler(GroupSampler):
         for name, own in self._identity().items():
             stored = state_dict.get(name)
             if not isinstance(stored, Tensor) or not torch.equal(stored.cpu(), own):
-                raise ValueError(
-                    f"state_dict has a different {name} than this sampler ({name}={getattr(self, name)!r})"
-                )
+                raise ValueError(f"state_dict has a different {name} than this sampler: {getattr(self, name)!r}")
         super().load_state_dict(state_dict)

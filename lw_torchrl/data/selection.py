@@ -11,7 +11,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from lw_torchrl._util.checks import Count, Probability, check_value, shown, typed_fields, unknown_name
+from lw_torchrl._util.checks import Count, Probability, check_choice, check_value, shown, typed_fields
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo, load_rows, read_metadata, verify
 from lw_torchrl.data.rewards import REWARDS, RewardName, episode_returns
@@ -48,8 +48,7 @@ class EpisodeFilter:
         """Return the parts with only the kept episodes, given the return and length (E, 2) of each part's episodes."""
         labels = {part.config.behaviour for part in parts}
         for label in self.behaviours or ():
-            if label not in labels:
-                raise unknown_name("keep: behaviours", label, sorted(labels))
+            check_choice("keep: behaviours", label, sorted(labels))
         listed = [
             (place, episode, total, rows)
             for place, (part, returns_of_part) in enumerate(zip(parts, returns, strict=True))
@@ -89,21 +88,24 @@ use and whose values are an N or a list of episode indices.
 """
 
 
+def episodes_by_task(dataset: Demonstrations) -> dict[str, list[int]]:
+    existing: dict[str, list[int]] = {}
+    for episode in dataset.episodes:
+        existing.setdefault(episode.task, []).append(episode.episode)
+    return existing
+
+
 def choose_episodes(dataset: Demonstrations, choice: EpisodeChoice, argument: str = "episodes") -> Demonstrations:
     """Return a dataset's description with only the chosen episodes, in the order of the dataset."""
     if choice is None:
         return dataset
-    existing: dict[str, list[int]] = {}
-    for episode in dataset.episodes:
-        existing.setdefault(episode.task, []).append(episode.episode)
+    existing = episodes_by_task(dataset)
     choices = choice if isinstance(choice, Mapping) else dict.fromkeys(existing, choice)
     if not choices:
         raise ValueError(f"{argument} must choose at least one episode, got {shown(choice)}")
     keep: set[tuple[str, int]] = set()
     for task, wanted in choices.items():
-        if task not in existing:
-            raise unknown_name(f"{argument}: task", task, existing)
-        of_task, place = existing[task], f"{argument}[{task!r}]"
+        of_task, place = existing[check_choice(f"{argument}: task", task, existing)], f"{argument}[{task!r}]"
         numbers = list(wanted) if isinstance(wanted, Sequence) else of_task[: check_value(place, wanted, Count)]
         is_short = not isinstance(wanted, Sequence) and len(numbers) < wanted
         if is_short or not numbers or len({*numbers}) < len(numbers) or not {*numbers} <= {*of_task}:
@@ -133,14 +135,6 @@ def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName
     return episode_returns(kind.of(rows.get(f"reward_{kind.source}")[kept], rows.get("success")[kept]), lengths)
 
 
-def check_label(label: str, parts: Sequence[Demonstrations]) -> None:
-    """Raise :class:`ValueError` if the label requires expert actions, but another policy collected a dataset."""
-    others = sorted({part.config.behaviour for part in parts if part.config.policy.kind != "expert"})
-    if others and label != "executed":
-        needs = f"label={label!r} requires expert actions, but this dataset was collected by {', '.join(others)!r}"
-        raise ValueError(f"{needs}; use label='executed'")
-
-
 def check_behaviours(parts: Sequence[Demonstrations]) -> None:
     """Raise :class:`ValueError` if datasets use the same label for different behaviours."""
     first: dict[str, Demonstrations] = {}
@@ -149,23 +143,6 @@ def check_behaviours(parts: Sequence[Demonstrations]) -> None:
         if before.config.policy.acts != part.config.policy.acts:
             folders = f"{str(before.root)!r} and {str(part.root)!r}"
             raise ValueError(f"root: the label {part.config.behaviour!r} stands for different behaviours in {folders}")
-
-
-def _folders_and_choices(
-    root: AnyPath | Iterable[AnyPath], episodes: EpisodeChoice | Sequence[EpisodeChoice]
-) -> tuple[list[AnyPath], list[Any]]:
-    """Return the list of folders, and the choice of episodes for each folder."""
-    if isinstance(root, (str, os.PathLike)):
-        return [root], [episodes]
-    folders = list(root)
-    is_repeated = episodes is None and len({Path(folder).resolve() for folder in folders}) < len(folders)
-    if not folders or is_repeated:
-        raise ValueError(f"root must be a folder, or a list of distinct folders, got {folders}")
-    if episodes is None:
-        return folders, [None] * len(folders)
-    if not isinstance(episodes, Sequence) or len(episodes) != len(folders):
-        raise ValueError(f"episodes must be a list of {len(folders)} choices, one for each folder, got {episodes!r}")
-    return folders, list(episodes)
 
 
 def select(
@@ -181,14 +158,21 @@ def select(
 
     See :func:`load_demonstrations` for the arguments.
     """
-    folders, choices = _folders_and_choices(root, episodes)
+    is_single = isinstance(root, (str, os.PathLike))
+    folders: list[Any] = [root] if is_single else list(root)  # type: ignore[arg-type]
+    choices: Any = [episodes] if is_single else [None] * len(folders) if episodes is None else episodes
+    if not folders or (episodes is None and len({Path(folder).resolve() for folder in folders}) < len(folders)):
+        raise ValueError(f"root must be a folder, or a list of distinct folders, got {folders}")
+    if not isinstance(choices, Sequence) or len(choices) != len(folders):
+        raise ValueError(f"episodes must be a list of {len(folders)} choices, one for each folder, got {episodes!r}")
     datasets = [read_metadata(folder) for folder in folders]
-    check_label(label, datasets)
+    others = ", ".join(sorted({each.config.behaviour for each in datasets if each.config.policy.kind != "expert"}))
+    if others and label != "executed":
+        raise ValueError(f"label={label!r} needs an expert, but {others!r} collected the dataset; use label='executed'")
     check_behaviours(datasets)
     sizes = {(dataset.config.layout.size, dataset.config.layout.action_size) for dataset in datasets}
     if len(sizes) > 1:
         raise ValueError(f"root: all folders must have the same observation and action sizes, got {sizes}")
-    is_single = isinstance(root, (str, os.PathLike))
     parts = [
         choose_episodes(dataset, choice, "episodes" if is_single else f"episodes[{number}]")
         for number, (dataset, choice) in enumerate(zip(datasets, choices, strict=True))
@@ -230,9 +214,5 @@ class JoinedDemonstrations:
 
     @property
     def config(self) -> JoinedConfig:
-        chosen: list[dict[str, list[int]]] = []
-        for part in self.parts:
-            chosen.append({})
-            for episode in part.episodes:
-                chosen[-1].setdefault(episode.task, []).append(episode.episode)
-        return JoinedConfig(tuple(part.config for part in self.parts), tuple(chosen))
+        chosen = tuple(episodes_by_task(part) for part in self.parts)
+        return JoinedConfig(tuple(part.config for part in self.parts), chosen)

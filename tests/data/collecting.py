@@ -1,8 +1,8 @@
 """Small datasets and policies for the tests of this folder, and helpers on their files."""
 
-import json
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,22 @@ def collect(root, tasks=TASKS, **changed):
     return collect_demonstrations(tasks, root=root, **{**options, **changed})
 
 
+KINDS = {
+    "expert": {},
+    "unclipped": dict(label="unclipped"),
+    "executed": dict(label="executed", reward="dense"),
+    "cut": dict(label="executed", after_success=3),
+    "chosen": dict(episodes=2),
+    "n steps": dict(label="executed", n_steps=3, gamma=0.9),
+}
+
+
+def open_replay(root, kind="expert", seed=0, **options):
+    generator = torch.Generator().manual_seed(seed)
+    defaults = dict(batch_size=8, generator=generator)
+    return lw.LanguageWorldExperienceReplay(root, **{**defaults, **KINDS[kind], **options})
+
+
 def tree(root):
     """Every file below a folder with its bytes."""
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
@@ -46,13 +62,11 @@ def tree(root):
 def restate_checksums(root):
     """Write the checksums of the present rows to a dataset's metadata."""
     dataset = read_metadata(root)
-    rows = load_rows(dataset)
-    metadata = json.loads((root / "metadata.json").read_text())
-    metadata["episodes"]["checksum"] = [
-        describe_episode(info.task, info.episode, info.start, rows[info.start : info.start + info.length]).checksum
-        for info in dataset.episodes
-    ]
-    (root / "metadata.json").write_text(json.dumps(metadata))
+    rows, episodes = load_rows(dataset), []
+    for info in dataset.episodes:
+        steps = rows[info.start : info.start + info.length]
+        episodes.append(describe_episode(info.task, info.episode, info.start, steps))
+    write_metadata(replace(dataset, episodes=tuple(episodes)))
 
 
 def interrupt_after(monkeypatch, episodes):
@@ -105,22 +119,17 @@ def random_dataset(root: Path, lengths: Sequence[Sequence[int]], seed: int = 0) 
     parts = []
     for task, of_task in zip(tasks, lengths, strict=True):
         for episode, steps in enumerate(of_task):
-            states, ends = numbers(steps + 1, 39), torch.zeros(steps, 1, dtype=torch.bool)
-            ends[-1] = True
+            states, number = numbers(steps + 1, 39), torch.full((steps,), task_id(task))
             success = torch.from_numpy(draws.random((steps, 1)) < 0.2)
-            rows = TensorDict({}, [steps])
-            for key, (shape, _) in COLUMNS.items():
-                rows.set(key, numbers(steps, *shape))
-            number = torch.full((steps,), task_id(task))
-            rows.update({"observation": states[:-1], "task_id": number, "episode": torch.full_like(number, episode)})
-            rows.set("action", rows.get("action").clamp(-1, 1)).set(("next", "observation"), states[1:])
-            rows.set(("next", "task_id"), number)
-            rows.set(("next", "reward_sparse"), success.float()).set(("next", "success"), success)
-            rows.set(("next", "done"), ends).set(("next", "truncated"), ends).set(("next", "terminated"), ends & False)
+            ends = torch.arange(steps)[:, None] == steps - 1
+            after = {"observation": states[1:], "task_id": number, "success": success, "done": ends}
+            after |= {"truncated": ends, "terminated": ends & False, "reward_sparse": success.float()}
+            rows = TensorDict({key: numbers(steps, *shape) for key, (shape, _) in COLUMNS.items()}, [steps])
+            rows.set("action", rows.get("action").clamp(-1, 1)).set("episode", torch.full_like(number, episode))
+            rows.update({"observation": states[:-1], "task_id": number, "next": after})
             parts.append((task, episode, rows))
     config = CollectConfig(tasks, len(lengths[0]), seed, max_steps=max(map(max, lengths)))
     infos = write_rows(root / DATA, parts, config.layout)
-    numbers_of = {task: task_id(task) for task in tasks}
-    attempts = dict.fromkeys(tasks, len(lengths[0]))
+    numbers_of, attempts = {task: task_id(task) for task in tasks}, dict.fromkeys(tasks, len(lengths[0]))
     write_metadata(Demonstrations(root, config, package_versions(), numbers_of, infos, attempts))
     return read_metadata(root)

@@ -12,7 +12,6 @@ from collecting import EPISODES, NOISE, SEED, STEPS, TASKS, collect, interrupt_a
 import lw_torchrl as lw
 from lw_torchrl.data import CollectConfig
 from lw_torchrl.data.dataset import load_rows, read_metadata
-from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.rows import action_noise, episode_seed
 from lw_torchrl.language.tasks import MT50
 from lw_torchrl.suites.metaworld.environments import make_metaworld_env
@@ -22,24 +21,15 @@ CONFIG = CollectConfig(TASKS, EPISODES, SEED, noise_scale=NOISE, max_steps=STEPS
 
 def test_rows_have_the_documented_keys_shapes_and_dtypes(rows):
     total = len(TASKS) * EPISODES * STEPS
-    number, flag = torch.int64, torch.bool
-    expected = {
-        "observation": ((total, 39), torch.float32),
-        "task_id": ((total,), number),
-        "episode": ((total,), number),
-        "action": ((total, 4), torch.float32),
-        "expert_action": ((total, 4), torch.float32),
-        "unclipped_action": ((total, 4), torch.float32),
-        ("collector", "traj_ids"): ((total,), number),
-        ("next", "observation"): ((total, 39), torch.float32),
-        ("next", "task_id"): ((total,), number),
-        ("next", "reward_sparse"): ((total, 1), torch.float32),
-        ("next", "reward_dense"): ((total, 1), torch.float32),
-        **{("next", key): ((total, 1), flag) for key in ("success", "done", "terminated", "truncated")},
-    }
+    expected = dict.fromkeys(["observation", ("next", "observation")], ((total, 39), torch.float32))
+    expected |= dict.fromkeys(["action", "expert_action", "unclipped_action"], ((total, 4), torch.float32))
+    numbers = ["task_id", "episode", ("collector", "traj_ids"), ("next", "task_id")]
+    expected |= dict.fromkeys(numbers, ((total,), torch.int64))
+    expected |= dict.fromkeys([("next", "reward_sparse"), ("next", "reward_dense")], ((total, 1), torch.float32))
+    flags = ("success", "done", "terminated", "truncated")
+    expected |= {("next", key): ((total, 1), torch.bool) for key in flags}
     assert rows.batch_size == (total,)
-    actual = {key: (tuple(rows[key].shape), rows[key].dtype) for key in rows.keys(True, True)}
-    assert actual == expected
+    assert {key: (tuple(rows[key].shape), rows[key].dtype) for key in rows.keys(True, True)} == expected
 
 
 def test_episodes_are_consecutive_and_end_by_truncation(dataset, rows):
@@ -50,28 +40,13 @@ def test_episodes_are_consecutive_and_end_by_truncation(dataset, rows):
     for number, episode in enumerate(dataset.episodes):
         assert (episode.start, episode.length) == (number * STEPS, STEPS)
         part = rows[episode.start : episode.start + episode.length]
-        assert (part["task_id"] == MT50.index(episode.task)).all()
-        assert (part["next", "task_id"] == MT50.index(episode.task)).all()
-        assert (part["episode"] == episode.episode).all()
+        for key, value in (("task_id", MT50.index(episode.task)), ("episode", episode.episode)):
+            assert (part[key] == value).all()
+        assert torch.equal(part["next", "task_id"], part["task_id"])
         assert torch.equal(part["observation"][1:], part["next", "observation"][:-1])
         assert not part["next", "terminated"].any()
         for key in ("done", "truncated"):
             assert part["next", key].flatten().tolist() == [False] * (STEPS - 1) + [True]
-
-
-@pytest.mark.parametrize("kind", ["sparse", "dense"])
-@pytest.mark.parametrize("task", TASKS)
-def test_both_rewards_equal_the_environments(dataset, rows, task, kind):
-    env = LanguageWorldEnv(task, num_envs=EPISODES, seed=SEED, max_steps=STEPS, reward=kind)
-    first = next(episode.start for episode in dataset.episodes if episode.task == task)
-    part = rows[first : first + EPISODES * STEPS].reshape(EPISODES, STEPS)
-    state = env.reset()
-    assert torch.equal(state["episode"], part["episode"][:, 0])
-    for t in range(STEPS):
-        state = env.step(state.set("action", part["action"][:, t].clone()))["next"]
-        assert torch.equal(state["reward"], part["next", f"reward_{kind}"][:, t])
-    assert kind == "sparse" or part["next", "reward_dense"].unique().numel() > STEPS
-    env.close()
 
 
 def test_metadata_record_configuration_and_versions(dataset):
@@ -90,35 +65,25 @@ def test_success_is_recorded_for_each_episode(tmp_path):
     dataset = collect(tmp_path / "demos", "reach", max_steps=50, episodes_per_task=4, noise_scale=0.0, seed=0)
     rows = load_rows(dataset)
     for episode in dataset.episodes:
-        successes = (
-            rows["next", "success"][episode.start : episode.start + episode.length].flatten().nonzero().flatten()
-        )
-        assert episode.success == (len(successes) > 0)
-        assert episode.first_success == (int(successes[0]) + 1 if len(successes) else None)
+        success = rows["next", "success"][episode.start : episode.start + episode.length].flatten().tolist()
+        assert episode.success == any(success)
+        assert episode.first_success == (success.index(True) + 1 if any(success) else None)
     rate = sum(e.success for e in dataset.episodes) / 4
     assert 0 < rate < 1, "the test needs successes and failures"
     assert dataset.success_rate == {"reach": rate}
 
 
-def test_executed_action_is_the_experts_plus_noise_clipped(dataset, rows):
+@pytest.mark.parametrize("hold", [1, 4])
+def test_executed_action_is_the_experts_plus_noise_clipped(tmp_path, hold):
+    rows = load_rows(dataset := collect(tmp_path / "demos", noise_hold=hold))
     for episode in dataset.episodes:
         part = rows[episode.start : episode.start + STEPS]
         scale = NOISE[episode.episode % len(NOISE)]
-        noise = action_noise(episode.task, SEED, episode.episode, STEPS) * np.float32([scale] * 3 + [scale * 0.2])
-        expected = (part["expert_action"] + torch.from_numpy(noise)).clamp(-1, 1)
-        assert torch.equal(part["action"], expected)
+        noise = action_noise(episode.task, SEED, episode.episode, -(-STEPS // hold)).repeat(hold, 0)[:STEPS]
+        noise = torch.from_numpy(noise * np.float32([scale] * 3 + [scale * 0.2]))
+        assert torch.equal(part["action"], (part["expert_action"] + noise).clamp(-1, 1))
         assert torch.equal(part["action"], part["expert_action"]) == (scale == 0)
-        assert part["action"].abs().max() <= 1
         assert part["expert_action"].abs().max() <= 1
-
-
-def test_noise_is_constant_for_noise_hold_steps(tmp_path):
-    dataset = collect(tmp_path / "demos", "reach", episodes_per_task=2, noise_scale=0.05, noise_hold=4, seed=2)
-    rows = load_rows(dataset)
-    draws = action_noise("reach", 2, 1, 4) * np.float32([0.05, 0.05, 0.05, 0.01])
-    part = rows[STEPS:]
-    expected = (part["expert_action"] + torch.from_numpy(draws.repeat(4, 0)[:STEPS])).clamp(-1, 1)
-    assert torch.equal(part["action"], expected)
 
 
 @pytest.mark.filterwarnings("ignore:Constant.s. may be too high")
@@ -133,7 +98,7 @@ def test_unclipped_action_is_that_of_metaworlds_script(rows, task):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_stored_actions_reproduce_the_observations_in_metaworld(dataset, rows, task):
+def test_stored_actions_reproduce_observations_and_rewards_in_metaworld(dataset, rows, task):
     env = make_metaworld_env(task)
     for episode in (e for e in dataset.episodes if e.task == task):
         part = rows[episode.start : episode.start + STEPS]
@@ -141,22 +106,11 @@ def test_stored_actions_reproduce_the_observations_in_metaworld(dataset, rows, t
         observation, _ = env.reset()
         for t in range(STEPS):
             assert np.array_equal(part["observation"][t].numpy(), observation.astype(np.float32))
-            observation, _, _, _, info = env.step(part["action"][t].numpy())
+            observation, reward, _, _, info = env.step(part["action"][t].numpy())
             assert np.array_equal(part["next", "observation"][t].numpy(), observation.astype(np.float32))
-            assert bool(part["next", "success"][t]) == bool(info["success"])
+            assert part["next", "success"][t].item() == part["next", "reward_sparse"][t].item() == info["success"]
+            assert part["next", "reward_dense"][t].item() == np.float32(reward)
     env.close()
-
-
-@pytest.mark.parametrize("num_envs", [2, 5, 9])
-def test_num_envs_does_not_change_the_dataset(dataset, tmp_path, num_envs):
-    collect(tmp_path / "demos", num_envs=num_envs)
-    assert tree(tmp_path / "demos") == tree(dataset.root)
-
-
-def test_a_tasks_rows_do_not_depend_on_other_tasks(rows, tmp_path):
-    alone = load_rows(collect(tmp_path / "demos", "reach")).exclude("collector")
-    together = rows[rows["task_id"] == MT50.index("reach")].exclude("collector")
-    assert (alone == together).all()
 
 
 REDRAW = dict(tasks="reach", episodes_per_task=3, max_steps=50, noise_scale=(0.4,))
@@ -175,8 +129,8 @@ def test_redrawing_keeps_only_the_first_successes(redrawn, tmp_path):
     assert [e.episode for e in redrawn.episodes] == successes
     assert redrawn.success_rate == {"reach": 1.0}
     all_rows, kept_rows = load_rows(everything), load_rows(redrawn)
-    expected = all_rows[torch.isin(all_rows["episode"], torch.tensor(successes))].exclude("collector")
-    assert (kept_rows.exclude("collector") == expected).all()
+    expected = all_rows[torch.isin(all_rows["episode"], torch.tensor(successes))]
+    assert (kept_rows.exclude("collector") == expected.exclude("collector")).all()
 
 
 def test_redrawing_resumes_after_an_interruption(redrawn, tmp_path, monkeypatch):
@@ -186,8 +140,3 @@ def test_redrawing_resumes_after_an_interruption(redrawn, tmp_path, monkeypatch)
     monkeypatch.undo()
     collect(tmp_path / "demos", redraw_failures=True, **REDRAW)
     assert tree(tmp_path / "demos") == tree(redrawn.root)
-
-
-def test_redrawing_stops_if_nothing_succeeds(tmp_path):
-    with pytest.raises(RuntimeError, match=r"'reach'.*noise_scale"):
-        collect(tmp_path / "demos", "reach", episodes_per_task=1, max_steps=1, redraw_failures=True)

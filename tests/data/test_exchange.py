@@ -66,11 +66,6 @@ def test_export_and_import_change_no_bit(format):
     check()
 
 
-def plan_holds(made):
-    rows = load_rows(made)
-    return lw.QAFTransform(lw.load_plans("MT50"))(rows.select("observation", "task_id").clone())["qaf"].numpy()
-
-
 def test_lerobot_tables_hold_rows_statistics_and_tasks(made, exported):
     out, rows = exported("lerobot"), load_rows(made)
     info = json.loads((out / "meta" / "info.json").read_text())
@@ -83,19 +78,18 @@ def test_lerobot_tables_hold_rows_statistics_and_tasks(made, exported):
         assert values.tobytes() == np.asarray(rows[key]).tobytes()
     assert data.column("next.reward").to_pylist() == rows["next", "reward_dense"].flatten().tolist()
     holds = np.array(data.column("plan_holds").to_pylist())
-    assert (holds == plan_holds(made)[:, : holds.shape[1]]).all()
+    expected = lw.QAFTransform(lw.load_plans("MT50"))(rows.select("observation", "task_id").clone())["qaf"].numpy()
+    assert (holds == expected[:, : holds.shape[1]]).all()
     stats = json.loads((out / "meta" / "stats.json").read_text())
     values = np.asarray(rows["action"], dtype=np.float64)
-    assert stats["action"]["mean"] == pytest.approx(values.mean(0).tolist())
-    assert stats["action"]["std"] == pytest.approx(values.std(0).tolist())
-    assert stats["action"]["min"] == values.min(0).tolist()
+    for kind in ("mean", "std", "min"):
+        assert stats["action"][kind] == pytest.approx(getattr(values, kind)(0).tolist())
     episodes = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert [episode["dataset_to_index"] for episode in episodes] == [5, 8, 12, 21]
     assert episodes[3]["tasks"] == [lw.TASKS["push"].description]
     assert episodes[1]["stats/action/max"] == pytest.approx(values[5:8].max(0).tolist())
-    tasks = pq.read_table(out / "meta/tasks.parquet").to_pylist()
-    assert tasks[1]["name"] == "push"
-    assert tasks[1]["plan"] == str(lw.load_plans("MT50")["push"]).rstrip()
+    task = pq.read_table(out / "meta/tasks.parquet").to_pylist()[1]
+    assert (task["name"], task["plan"]) == ("push", str(lw.load_plans("MT50")["push"]).rstrip())
 
 
 def test_an_export_with_other_plans_holds_their_text_and_truth(made, tmp_path):
@@ -139,10 +133,9 @@ def test_damaged_files_are_errors_with_the_path(made, exported, tmp_path, format
     source = shutil.copytree(exported(format), tmp_path / "copy")
     (path, *_) = sorted(source.rglob("*.parquet" if format == "lerobot" else "*.hdf5"))
     content, errors = path.read_bytes(), []
-    changes = [content[:-100]]
-    for place in np.random.default_rng(0).integers(0, len(content), 10).tolist():
-        changes.append(content[:place] + bytes([content[place] ^ 0x55]) + content[place + 1 :])
-    for number, changed in enumerate(changes):
+    places = np.random.default_rng(0).integers(0, len(content), 10).tolist()
+    changes = [content[:at] + bytes([content[at] ^ 0x55]) + content[at + 1 :] for at in places]
+    for number, changed in enumerate([content[:-100], *changes]):
         path.write_bytes(changed)
         try:
             again = lw.import_dataset(source, tmp_path / f"again{number}")
@@ -187,9 +180,8 @@ def test_a_full_disk_is_an_error_before_minari_writes(made, monkeypatch, tmp_pat
     assert written < reserved[0]
 
 
-LEROBOT = os.environ.get(
-    "LEROBOT_PYTHON", ""
-)  # a Python with lerobot, which cannot be installed with our version of rerun
+# A Python with lerobot, which cannot be installed with our version of rerun.
+LEROBOT = os.environ.get("LEROBOT_PYTHON", "")
 READ_BY_LEROBOT = """
 import hashlib, json, sys
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -199,7 +191,7 @@ import huggingface_hub
 root, work = sys.argv[1:]
 dataset = LeRobotDataset("mine/demos", root=root)
 rows = [dataset[place] for place in range(len(dataset))]
-names = ["observation.state", "next.observation", "action", "expert_action", "next.reward", "next.reward_sparse"]
+names = ["observation.state", "next.observation", "action", "expert_action", "next.reward"]
 read = {name: hashlib.sha256(b"".join(row[name].numpy().tobytes() for row in rows)).hexdigest() for name in names}
 read["task"] = [row["task"] for row in rows]
 read["success"] = [bool(row["next.success"]) for row in rows]
@@ -281,7 +273,7 @@ def test_videos_have_a_picture_for_each_row(drawn, tmp_path, monkeypatch, togeth
     rows = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert [row[f"videos/{KEY}/file_index"] for row in rows] == [number // together for number in range(4)]
     for episode, row in zip(made.episodes, rows, strict=True):
-        place = {"chunk_index": row[f"videos/{KEY}/chunk_index"], "file_index": row[f"videos/{KEY}/file_index"]}
+        place = {name: row[f"videos/{KEY}/{name}"] for name in ("chunk_index", "file_index")}
         path = out / info["video_path"].format(video_key=KEY, **place)
         brightness = frames(path, row[f"videos/{KEY}/from_timestamp"], episode.length)
         shades = pictures.read(made.root, episode).numpy().mean((1, 2, 3))

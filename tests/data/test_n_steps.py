@@ -2,7 +2,6 @@
 
 from itertools import pairwise
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,7 +10,7 @@ from torchrl.data import MultiStep
 from torchrl.modules import ValueOperator
 from torchrl.objectives.value import TD0Estimator
 
-from lw_torchrl.data import LanguageWorldExperienceReplay, collect_demonstrations, n_step_returns
+from lw_torchrl.data import n_step_returns
 
 
 def make_rows(lengths):
@@ -81,20 +80,3 @@ def test_a_value_estimator_discounts_by_the_steps():
     after = value.module(ahead["next", "observation"])
     expected = ahead["next", "reward"] + 0.9 ** torch.tensor([[3.0], [3.0], [3.0], [2.0], [1.0]]) * after
     torch.testing.assert_close(target, expected.detach())
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    root = tmp_path_factory.mktemp("made") / "demos"
-    collect_demonstrations("reach", episodes_per_task=3, root=root, max_steps=50, noise_scale=(0.2,), progress=False)
-    return root
-
-
-@pytest.mark.parametrize("after", [None, 4])
-def test_n_steps_of_a_dataset_end_with_the_episode(root, after):
-    options = dict(label="executed", reward="dense", after_success=after)
-    plain = LanguageWorldExperienceReplay(root, **options)[:]
-    ahead = LanguageWorldExperienceReplay(root, n_steps=5, gamma=0.99, **options)[:]
-    check(ahead, torchrls(trajectories(plain), 5, 0.99))
-    assert ahead["next", "done"].sum() == 15
-    assert torch.equal(ahead["task_id"], ahead["next", "task_id"])

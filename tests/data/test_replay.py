@@ -1,11 +1,13 @@
-"""LanguageWorldExperienceReplay: rows, labels, rewards, ends of episodes, transforms, columns and its saved state."""
+"""LanguageWorldExperienceReplay: rows, labels, ends of episodes, transforms, columns, joined datasets, saved state."""
 
 import functools
+import json
+import os
 import pickle
 
 import pytest
 import torch
-from collecting import Evil, collect, tree
+from collecting import KINDS, Evil, collect, open_replay, tree
 from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import RandomSampler, SamplerWithoutReplacement, SliceSampler
@@ -22,57 +24,18 @@ from torchrl.envs.transforms import (
 )
 
 import lw_torchrl as lw
-from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
+from lw_torchrl.data import CoLearningSampler, JoinedDemonstrations, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.data.dataset import load_rows
 from lw_torchrl.language.query_program import QueryProgram
 
-STEPS = 50
 PLANS = lw.load_plans("MT10")
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """Two failures, then successes at steps 36 and 48, of 50."""
-    root = tmp_path_factory.mktemp("made") / "demos"
-    dataset = collect(root, "reach", episodes_per_task=4, seed=0, max_steps=STEPS)
-    assert {e.success for e in dataset.episodes} == {True, False}, "the tests need successes and failures"
-    return dataset
-
-
 @pytest.mark.parametrize("label", ["expert", "executed"])
-@pytest.mark.parametrize("after", [0, 1, 5, 13, 20, 499])
-def test_after_success_drops_exactly_the_later_rows(made, label, after):
-    rows, kept, last = load_rows(made), [], []
-    for episode in made.episodes:
-        for t in range(episode.length):
-            successes = [h for h in range(episode.length) if rows["next", "success"][episode.start + h]]
-            if not successes or t <= successes[0] + after:
-                kept.append(episode.start + t)
-                if t == episode.length - 1 or (successes and t == successes[0] + after):
-                    last.append(episode.start + t)
-    assert len(kept) < len(rows) or after > 13
-    replay = LanguageWorldExperienceReplay(made.root, label=label, after_success=after)
-    shown, expected = replay[:], rows[torch.tensor(kept)]
-    assert len(replay) == len(kept)
-    assert torch.equal(shown["observation"], expected["observation"])
-    assert torch.equal(shown["action"], expected["expert_action" if label == "expert" else "action"])
-    if label == "executed":
-        ends = torch.isin(torch.tensor(kept), torch.tensor(last))
-        for key in ("done", "truncated"):
-            assert torch.equal(shown["next", key].flatten(), ends)
-        assert not shown["next", "terminated"].any()
-        for key in ("observation", "reward_dense", "success"):
-            assert torch.equal(shown["next", key], expected["next", key])
-        assert torch.equal(shown["next", "reward"], expected["next", "success"].float())
-
-
-@pytest.mark.parametrize("label", ["expert", "executed"])
-def test_a_transform_answers_the_plans_queries(made, label):
-    replay = LanguageWorldExperienceReplay(made.root, batch_size=32, label=label, transform=lw.QAFTransform(PLANS))
+def test_a_transform_answers_the_plans_queries(dataset, label):
+    replay = open_replay(dataset.root, batch_size=32, label=label, transform=lw.QAFTransform(PLANS))
     batch = replay.sample()
     program = QueryProgram({task: [step.condition for step in plan.steps] for task, plan in PLANS.items()})
-    assert batch["qaf"].dtype == torch.bool
-    assert batch["qaf"].shape == (32, PLANS.num_steps)
     assert torch.equal(batch["qaf"], program(batch["observation"], batch["task_id"]))
     assert (("next", "qaf") in batch.keys(True)) == (label == "executed")
     if label == "executed":
@@ -82,12 +45,10 @@ def test_a_transform_answers_the_plans_queries(made, label):
 
 @pytest.mark.parametrize("sampler", [TaskBalancedSampler, lambda: CoLearningSampler("push")])
 def test_prefetching_one_batch_gives_the_same_batches(dataset, sampler):
-    def make(prefetch):
-        generator, transform = torch.Generator().manual_seed(0), lw.QAFTransform(PLANS)
-        options = dict(sampler=sampler(), transform=transform, generator=generator, batch_size=8)
-        return LanguageWorldExperienceReplay(dataset.root, prefetch=prefetch, **options)
-
-    ahead, now = make(1), make(None)
+    ahead, now = (
+        open_replay(dataset.root, sampler=sampler(), transform=lw.QAFTransform(PLANS), prefetch=prefetch)
+        for prefetch in (1, None)
+    )
     for _ in range(40):
         assert (ahead.sample() == now.sample()).all()
     assert ahead._prefetch_queue
@@ -130,8 +91,7 @@ def test_frames_of_slices_are_of_one_episode(dataset):
     batch = LanguageWorldExperienceReplay(dataset.root, **options).sample()
     for frames, episode in zip(batch["frames"].unflatten(-1, (3, -1)), batch["collector", "traj_ids"], strict=True):
         for frame in frames:
-            own = (rows["observation"] == frame).all(-1)
-            assert episode in rows["collector", "traj_ids"][own]
+            assert episode in rows["collector", "traj_ids"][(rows["observation"] == frame).all(-1)]
 
 
 def test_an_inverse_transform_changes_samples(dataset):
@@ -145,77 +105,53 @@ def test_an_inverse_transform_changes_samples(dataset):
 
 @pytest.fixture(scope="module")
 def ending(tmp_path_factory):
-    """Episodes that succeed within 90 steps, opened with their ends at success."""
+    """Two demonstrations each of push and reach, which succeed within 90 steps."""
     root = tmp_path_factory.mktemp("ending") / "demos"
-    collect(root, episodes_per_task=2, seed=0, noise_scale=0.1, max_steps=90)
-    return lambda **options: LanguageWorldExperienceReplay(
-        root, label="executed", **{"terminate_on_success": True, **options}
-    )
-
-
-def repeated(replay, episode):
-    """Return the states to which an episode's executed actions lead in an environment that ends at success."""
-    rows = replay[:]
-    actions = rows["action"][episode.start : episode.start + episode.length]
-    seed = replay.demonstrations.config.seed
-    env = lw.LanguageWorldEnv(episode.task, seed=seed, max_steps=90, terminate_on_success=True)
-    state, states = env.reset(episode=episode.episode), []
-    for action in actions:
-        state = env.step(state.set("action", action.unsqueeze(0)))["next"]
-        states.append(state.clone())
-        if state["done"].any():
-            break
-    env.close()
-    return torch.cat(states)
+    return collect(root, episodes_per_task=2, seed=0, noise_scale=0.1, max_steps=90)
 
 
 def test_episodes_end_as_in_an_environment_that_ends_at_success(ending):
-    replay, whole = ending(), ending(terminate_on_success=False)
-    rows, episodes = replay[:], replay.demonstrations.episodes
-    assert any(episode.success for episode in episodes)
-    for number, episode in enumerate(episodes):
-        of_episode, expected = rows[rows["collector", "traj_ids"] == number], repeated(whole, episode)
+    """The executed actions lead to the same states in such an environment."""
+    rows = open_replay(ending.root, label="executed", terminate_on_success=True)[:]
+    assert any(episode.success for episode in ending.episodes)
+    for number, episode in enumerate(ending.episodes):
+        env = lw.LanguageWorldEnv(episode.task, seed=0, max_steps=90, terminate_on_success=True)
+        state, states = env.reset(episode=episode.episode), []
+        for action in load_rows(ending)["action"][episode.start : episode.start + episode.length]:
+            state = env.step(state.set("action", action.unsqueeze(0)))["next"]
+            states.append(state.clone())
+            if state["done"].any():
+                break
+        env.close()
+        of_episode, expected = rows[rows["collector", "traj_ids"] == number], torch.cat(states)
         for key in ("observation", "reward", "success", "done", "terminated", "truncated"):
             assert torch.equal(of_episode["next", key], expected[key]), (episode, key)
 
 
-def test_n_step_returns_terminate_at_success(ending):
-    rows = ending(n_steps=5, gamma=0.99)[:]
-    assert torch.equal(rows["next", "terminated"], rows["next", "success"])
-    assert (rows["next", "reward"][rows["next", "terminated"]] > 0).all()
+@pytest.mark.parametrize("ends", [dict(), dict(after_success=4), dict(terminate_on_success=True)])
+def test_n_steps_end_with_the_episode(ending, ends):
+    rows, ahead = (open_replay(ending.root, kind, reward="dense", **ends)[:] for kind in ("executed", "n steps"))
+    assert (ahead == lw.data.n_step_returns(rows, 3, 0.9)).all()
+    assert ahead["next", "done"].sum() == 3 * len(ending.episodes)
 
 
 # ---- the saved state
-
-
-KINDS = {
-    "plain": {},
-    "cut": dict(after_success=3),
-    "joined": dict(episodes=2),
-    "n steps": dict(label="executed", n_steps=3, gamma=0.9),
-}
-
-
-def open_replay(root, kind="plain", sampler=RandomSampler, seed=0, **options):
-    generator = torch.Generator().manual_seed(seed)
-    defaults = dict(batch_size=8, sampler=sampler(), generator=generator)
-    return LanguageWorldExperienceReplay(root, **{**defaults, **KINDS[kind], **options})
 
 
 def drawn(replay, batches=4):
     return torch.cat([replay.sample() for _ in range(batches)])
 
 
-@pytest.mark.parametrize("kind", ["plain", "cut", "joined", "n steps"])
+@pytest.mark.parametrize("kind", ["expert", "cut", "chosen", "n steps"])
 @pytest.mark.parametrize("sampler", [TaskBalancedSampler, RandomSampler, SamplerWithoutReplacement])
 @pytest.mark.parametrize("prefetch", [None, 1])
 def test_a_restored_buffer_gives_the_same_batches(dataset, tmp_path, kind, sampler, prefetch):
-    replay = open_replay(dataset.root, kind, sampler, prefetch=prefetch)
+    replay = open_replay(dataset.root, kind, sampler=sampler(), prefetch=prefetch)
     drawn(replay)
     replay.dumps(tmp_path / "saved")
     assert len(list((tmp_path / "saved").iterdir())) == 1
     expected = drawn(replay, 20)
-    again = open_replay(dataset.root, kind, sampler, seed=9, prefetch=prefetch)
+    again = open_replay(dataset.root, kind, seed=9, sampler=sampler(), prefetch=prefetch)
     drawn(again, 3)
     again.loads(tmp_path / "saved")
     batches = drawn(again, 20)
@@ -251,8 +187,7 @@ def test_planted_pickles_are_never_executed(dataset, tmp_path):
     folder, trace = tmp_path / "saved", tmp_path / "executed"
     replay = open_replay(dataset.root)
     replay.dumps(folder)
-    names = [path.name for path in folder.iterdir()] + ["prefetch.pkl", "other.pickle", "transform.t"]
-    for name in names:
+    for name in (*os.listdir(folder), "prefetch.pkl", "other.pickle", "transform.t"):
         (folder / name).write_bytes(pickle.dumps(Evil(trace)))
     with pytest.raises(ValueError, match=f"path: '{folder}' holds no"):
         replay.loads(folder)
@@ -261,32 +196,22 @@ def test_planted_pickles_are_never_executed(dataset, tmp_path):
 
 # ---- columns that users add
 
-VARIANTS = {
-    "one": lambda a, b: dict(root=a),
-    "experts": lambda a, b: dict(root=a, label="expert"),
-    "cut": lambda a, b: dict(root=a, after_success=2),
-    "joined": lambda a, b: dict(root=[a, b]),
-    "chosen": lambda a, b: dict(root=[a, b], episodes=[{"reach": [2, 0]}, {"push": [1]}]),
-    "n steps": lambda a, b: dict(root=[a, b], n_steps=3, gamma=0.9),
-    "on a device": lambda a, b: dict(root=a, device="cpu"),
-}
-
 
 @pytest.fixture
-def opened(dataset, other_dataset):
-    def open_variant(variant, **options):
-        variant = VARIANTS[variant](dataset.root, other_dataset.root)
-        return LanguageWorldExperienceReplay(**{"label": "executed", **variant, **options})
-
-    return open_variant
+def both(dataset, other_dataset):
+    return [dataset.root, other_dataset.root]
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+def numbered(replay):
+    return torch.arange(len(replay), dtype=torch.float32)[:, None]
+
+
+@pytest.mark.parametrize("folders", [1, 2])
+@pytest.mark.parametrize("kind", ["executed", "expert", "cut", "n steps"])
 @pytest.mark.parametrize("sampler", [RandomSampler, TaskBalancedSampler])
-def test_batches_hold_the_column_of_each_row(opened, variant, sampler):
-    replay = opened(variant, batch_size=12, sampler=sampler())
-    before = replay[:]
-    values = torch.arange(len(replay), dtype=torch.float32)[:, None]
+def test_batches_hold_the_column_of_each_row(both, folders, kind, sampler):
+    replay = open_replay(both[:folders], kind, batch_size=12, sampler=sampler(), device="cpu")
+    before, values = replay[:], numbered(replay)
     replay.add_column("advantage", values)
     replay.add_column("pair", torch.stack([values, -values], -1))
     assert torch.equal(replay[:]["advantage"], values)
@@ -299,45 +224,117 @@ def test_batches_hold_the_column_of_each_row(opened, variant, sampler):
         assert torch.equal(batch["observation"], before["observation"][batch["index"]])
 
 
-@pytest.mark.parametrize("variant", ["one", "joined"])
-def test_a_column_is_a_copy_without_a_graph(opened, variant):
-    replay = opened(variant, batch_size=4)
-    values = torch.zeros(len(replay), 1, requires_grad=True)
-    replay.add_column("advantage", values * 2)
+def test_a_column_is_a_copy_without_a_graph(dataset):
+    replay = open_replay(dataset.root)
+    replay.add_column("advantage", numbered(replay).requires_grad_() * 2)
     assert not replay.sample()["advantage"].requires_grad
-    plain = torch.zeros(len(replay), 1)
+    plain = numbered(replay)
     replay.add_column("other", plain)
     plain.fill_(7)
-    assert (replay[:]["other"] == 0).all()
+    assert torch.equal(replay[:]["other"], numbered(replay))
 
 
-@pytest.mark.parametrize("variant", ["one", "joined", "n steps"])
-def test_a_column_does_not_change_batches_and_state(opened, variant):
-    def make():
-        generator = torch.Generator().manual_seed(3)
-        return opened(variant, batch_size=8, sampler=TaskBalancedSampler(), generator=generator)
-
-    plain, columned = make(), make()
-    first = plain.sample(), columned.sample()
-    columned.add_column("advantage", torch.arange(len(columned)).float())
-    assert (first[0] == first[1]).all()
+@pytest.mark.parametrize("kind", ["executed", "n steps"])
+def test_a_column_does_not_change_batches_and_state(both, kind):
+    plain, columned, again = (open_replay(both, kind, sampler=TaskBalancedSampler()) for _ in range(3))
+    assert (plain.sample() == columned.sample()).all()
+    for replay in (columned, again):
+        replay.add_column("advantage", numbered(replay))
     state = columned.state_dict()
     assert set(state["_sampler"]) == set(plain.state_dict()["_sampler"])
-    expected = [plain.sample()["index"] for _ in range(5)]
-    assert all(torch.equal(columned.sample()["index"], index) for index in expected)
-    again = make()
-    again.add_column("advantage", torch.arange(len(again)).float())
     again.load_state_dict(state)
-    for index in expected:
-        batch = again.sample()
-        assert torch.equal(batch["index"], index)
-        assert torch.equal(batch["advantage"], index.float())
+    for _ in range(5):
+        expected = plain.sample()
+        for batch in (columned.sample(), again.sample()):
+            assert torch.equal(batch["advantage"].flatten(), expected["index"].float())
+            assert (batch.exclude("advantage") == expected).all()
 
 
-def test_values_of_other_rows_are_errors(opened, dataset, other_dataset):
-    replay, ahead = opened("joined"), opened("n steps")
-    replay.add_column("advantage", torch.zeros(len(ahead), 1), of=ahead)
-    turned = LanguageWorldExperienceReplay([other_dataset.root, dataset.root], label="executed")
+def test_values_of_other_rows_are_errors(both):
+    replay, ahead, turned = (open_replay(roots, "n steps") for roots in (both, both, both[::-1]))
+    replay.add_column("advantage", numbered(ahead), of=ahead)
     assert len(turned) == len(replay)
     with pytest.raises(ValueError, match="of must hold the rows"):
-        replay.add_column("other", torch.zeros(len(turned), 1), of=turned)
+        replay.add_column("other", numbered(turned), of=turned)
+
+
+# ---- several datasets and chosen episodes
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory):
+    """Four demonstrations of reach, with another seed."""
+    root = tmp_path_factory.mktemp("made") / "target"
+    dataset = collect(root, "reach", episodes_per_task=4, seed=1, max_steps=50, noise_scale=(0, 0.2))
+    assert {e.success for e in dataset.episodes} == {True, False}, "the tests need successes and failures"
+    return dataset
+
+
+def expected_rows(part, episodes, after=None):
+    """Return the rows of a dataset's episodes and their ends, by a loop over steps."""
+    rows, kept, ends = load_rows(part), [], []
+    for number, episode in enumerate(part.episodes):
+        if episodes is not None and (episode.task, episode.episode) not in episodes:
+            continue
+        success = rows["next", "success"][episode.start : episode.start + episode.length].flatten().tolist()
+        for t in range(episode.length):
+            if after is None or not any(success) or t <= success.index(True) + after:
+                kept.append(episode.start + t)
+                ends.append(False)
+        ends[-1] = True
+        assert (rows["collector", "traj_ids"][kept[-1]]) == number
+    return rows[torch.tensor(kept)], torch.tensor(ends)[:, None]
+
+
+@pytest.mark.parametrize("label", ["expert", "unclipped", "executed"])
+@pytest.mark.parametrize("after", [None, 0, 5, 20])
+def test_rows_are_those_of_each_dataset(ending, target, label, after):
+    roots, episodes = [ending.root, target.root], [None, {"reach": [1, 3]}]
+    replay = open_replay(roots, episodes=episodes, label=label, after_success=after)
+    first, first_ends = expected_rows(ending, None, after)
+    second, second_ends = expected_rows(target, [("reach", 1), ("reach", 3)], after)
+    second.set(("collector", "traj_ids"), second["collector", "traj_ids"] + 4)
+    expected = torch.cat([first, second])
+    if label != "executed":
+        expected["action"] = expected[f"{label}_action"]
+        expected = expected.exclude("next", "expert_action", "unclipped_action")
+    else:
+        expected["next", "reward"] = expected["next", "reward_sparse"]
+        expected["next", "done"] = expected["next", "truncated"] = torch.cat([first_ends, second_ends])
+    expected["behaviour"] = torch.zeros(len(expected), dtype=torch.int64)
+    expected["dataset"] = torch.tensor([0] * len(first) + [1] * len(second))
+    expected["is_demonstration"] = torch.ones(len(expected), dtype=torch.bool)
+    assert replay.behaviours == ("noisy",)
+    assert set(replay[:].keys(True, True)) == set(expected.keys(True, True))
+    assert (replay[:] == expected).all()
+
+
+@pytest.mark.parametrize(
+    ("choice", "episodes"),
+    [
+        (1, [("push", 0), ("reach", 0)]),
+        ({"reach": 1}, [("reach", 0)]),
+        ({"reach": [1], "push": 2}, [("push", 0), ("push", 1), ("reach", 1)]),
+        ({"reach": (1, 0)}, [("reach", 0), ("reach", 1)]),
+    ],
+)
+def test_episodes_are_chosen_from_one_dataset(ending, choice, episodes):
+    replay = open_replay(ending.root, episodes=choice, label="executed")
+    assert [(e.task, e.episode) for e in replay.demonstrations.episodes] == episodes
+    rows = replay[:].exclude("behaviour", "is_demonstration", ("next", "reward"))
+    assert (rows == expected_rows(ending, episodes)[0]).all()
+    assert replay.tasks == tuple(sorted({task for task, _ in episodes}))
+    assert replay.demonstrations.num_steps == len(replay) == 90 * len(episodes)
+    assert replay.data_path_root == ending.root
+
+
+def test_the_description_names_datasets_and_episodes(ending, target):
+    replay = open_replay([ending.root, str(target.root)], episodes=[1, {"reach": [2, 0]}])
+    joined = replay.demonstrations
+    assert isinstance(joined, JoinedDemonstrations)
+    assert [part.root for part in joined.parts] == list(replay.roots) == [ending.root, target.root]
+    assert joined.config.episodes == ({"push": [0], "reach": [0]}, {"reach": [0, 2]})
+    assert json.loads(json.dumps(joined.config.to_json()))["parts"][0] == ending.config.to_json()
+    for path in ("data_path_root", "data_path"):
+        with pytest.raises(ValueError, match="joins 2 datasets"):
+            getattr(replay, path)

@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 
 from lw_torchrl._util.checks import Count, typed
 from lw_torchrl._util.files import AnyPath, parse_json, read_json, replacing_folder
+from lw_torchrl._util.limits import LimitError
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.dataset import METADATA, Demonstrations, parse_metadata, read_metadata
 from lw_torchrl.data.exchange.imported import (
@@ -158,11 +159,9 @@ def import_dataset(
         metadata = _own_metadata(source)
         description = None if metadata is None else parse_metadata(metadata, target)
     if description is not None:
-        options = {"task": task is not None, "episodes_per_task": episodes_per_task is not None}
-        options |= {"suite": suite != "metaworld", "behaviour": behaviour != "imported"}
-        options |= {"episode_length": episode_length is not None}
-        if given := [name for name, is_given in options.items() if is_given]:
-            raise ValueError(f"{given[0]} must not be given: {str(source)!r} was written by export_dataset")
+        if (task, suite, behaviour, episodes_per_task, episode_length) != (None, "metaworld", "imported", None, None):
+            options = "task, suite, behaviour, episodes_per_task and episode_length"
+            raise ValueError(f"{options} must not be given: {str(source)!r} was written by export_dataset")
         with _needing(format), _reading(source):
             table = read_files(source, format != "lerobot", description.config.layout)
             columns, spans = exported_columns(table), [*table.spans()]
@@ -187,12 +186,10 @@ def _reading(source: Path) -> Iterator[None]:
     """Add the path of the source to errors raised within a ``with`` block."""
     try:
         yield
-    except ExchangeError as error:
+    except (ExchangeError, LimitError) as error:
         raise ExchangeError(f"source: {str(source)!r}: {error}") from error
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise ExchangeError(
-            f"source: {str(source)!r} has invalid metadata ({type(error).__name__}: {error})"
-        ) from error
+        raise ExchangeError(f"source: {str(source)!r} has invalid metadata ({error!r})") from error
 
 
 def _new_folder(out: AnyPath) -> Path:
@@ -211,9 +208,7 @@ def _format_of(source: Path) -> ImportFormat:
     for format, endings in (("robomimic", HDF5), ("lerobot", PARQUET)):
         if any(path.suffix.lower() in endings for path in data_files(source, endings)):
             return format  # type: ignore[return-value]
-    raise ExchangeError(
-        f"source: {str(source)!r} is not a LeRobot dataset, Minari dataset or robomimic HDF5 file; if it is, set format"
-    )
+    raise ExchangeError(f"source: {str(source)!r} is not a LeRobot, Minari or robomimic dataset; if it is, set format")
 
 
 def _own_metadata(source: Path) -> Mapping[str, Any] | None:

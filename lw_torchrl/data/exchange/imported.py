@@ -19,7 +19,7 @@ from tensordict import TensorDict
 
 from lw_torchrl._util.checks import shown, unknown_name
 from lw_torchrl._util.files import replacing_folder
-from lw_torchrl._util.limits import LimitError, run_limited
+from lw_torchrl._util.limits import run_limited
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour
@@ -37,23 +37,15 @@ class ExchangeError(DatasetError):
 
 @dataclass(frozen=True)
 class ImportedTable(EpisodeRows):
-    """The rows of consecutive episodes in another format's files.
-
-    Attributes:
-        columns, sources: arrays (R, ...) by the names of :data:`KEYS`, and the columns' names in the files.
-        lengths, tasks: the number of rows and the possible names of the task of each episode.
-        ends_known: whether the files state where episodes end.
-        unfit: for each column whose size does not fit, the column's name in the files.
-        notes: messages about data that the files lack.
-    """
+    """The rows of consecutive episodes in another format's files; :class:`.reader.Files` explains the attributes."""
 
     columns: Mapping[str, Array]
-    sources: Mapping[str, str]
     lengths: tuple[int, ...]
     tasks: tuple[tuple[str, ...], ...]
-    ends_known: bool
+    sources: Mapping[str, str]
     unfit: Mapping[str, str]
-    notes: tuple[str, ...]
+    ends_known: bool
+    notes: Sequence[str]
 
     def explain(self, name: str) -> str:
         """Return the end of a warning about a missing column if a column in the files has the wrong size, else ""."""
@@ -69,10 +61,7 @@ def read_files(source: Path, is_hdf5: bool, layout: Layout) -> ImportedTable:
         allowed = 100 * 10**6 + 50 * stored  # bytes of numbers; compressed files are smaller than their numbers
         argument = json.dumps([is_hdf5, allowed, {name: widths[name] for name in order}])
         command = [sys.executable, "-P", reader.__file__, str(source.absolute()), folder, argument]
-        try:
-            done = run_limited(command, stored)
-        except LimitError as error:
-            raise ExchangeError(str(error)) from None
+        done = run_limited(command, stored)
         report = Path(folder, "table.json")
         if done.returncode or not report.is_file():
             last = done.stderr.decode("utf-8", "replace").strip().splitlines()[-1:]
@@ -80,15 +69,13 @@ def read_files(source: Path, is_hdf5: bool, layout: Layout) -> ImportedTable:
         table: dict[str, Any] = json.loads(report.read_text("utf-8"))
         if "refused" in table:
             raise ExchangeError(table["refused"])
-        if "corrupted" in table:
-            raise ExchangeError(f"the files are corrupted ({table['corrupted']})")
         if "missing" in table:
             raise ModuleNotFoundError(f"no module named {table['missing']}", name=table["missing"])
         if "system" in table:
             raise OSError(*table["system"])
         columns = {name: np.load(Path(folder, f"{name}.npy"), allow_pickle=False) for name in table.pop("columns")}
-    lengths, tasks, notes = tuple(table["lengths"]), tuple(map(tuple, table["tasks"])), tuple(table["notes"])
-    return ImportedTable(columns, table["sources"], lengths, tasks, table["ends_known"], table["unfit"], notes)
+    table |= {"lengths": tuple(table["lengths"]), "tasks": tuple(map(tuple, table["tasks"]))}
+    return ImportedTable(columns, **table)
 
 
 def find_ends(table: ImportedTable, suite: Suite, episode_length: int | None) -> ImportedTable:
@@ -100,9 +87,7 @@ def find_ends(table: ImportedTable, suite: Suite, episode_length: int | None) ->
     """
     if table.ends_known:
         if episode_length is not None:
-            raise ValueError(
-                f"episode_length must not be given, got {episode_length}: the files state the episodes' ends"
-            )
+            raise ValueError(f"episode_length must not be given, got {episode_length}: the files state all ends")
         return table
     marks = np.zeros(table.rows, dtype=bool)
     for name in ("done", "terminated", "truncated"):
@@ -112,14 +97,11 @@ def find_ends(table: ImportedTable, suite: Suite, episode_length: int | None) ->
     limit, lengths, tasks, is_cut = episode_length or suite.max_steps, [], [], False
     for (start, end), task in zip(table.spans(), table.tasks, strict=True):
         inner = np.flatnonzero(marks[start:end]) + 1 + start
-        parts = [part for part in pairwise(np.unique([start, *inner, end]).tolist())]
+        parts = [*pairwise(np.unique([start, *inner, end]).tolist())]
         for first, last in parts:
             if len(parts) == 1 and (last - first) % limit and (last - first > limit or episode_length is not None):
-                hint = (
-                    f"the files do not state where episodes end, and {last - first} rows are not a multiple of {limit}"
-                )
-                wrong = "be given" if episode_length is None else "divide the number of rows"
-                raise ValueError(f"episode_length must {wrong}: {hint}")
+                rows = f"{last - first} rows, because the files do not state where episodes end"
+                raise ValueError(f"episode_length must divide {rows}; got {limit}")
             number = -(-(last - first) // limit)
             is_cut |= not inner.size or number > 1
             lengths += [limit] * (number - 1) + [last - first - limit * (number - 1)]
@@ -240,11 +222,9 @@ def task_names(table: ImportedTable, suite: Suite, task: str | Mapping[str | int
     for texts in {*table.tasks}:
         found = [mapped[text] for text in texts if text in mapped]
         found += [known[text] for each in texts for text in (each, _plain(each), _hyphens(each)) if text in known]
-        if not found and not texts:
-            raise ValueError("task must be given, for example 'reach', because the files do not state the task")
         if not found:
-            hint = f"; or map it with task={{{shown(texts[0])}: 'reach'}}, for example"
-            raise ValueError(f"{unknown_name('task', texts[0], suite.tasks)}{hint}")
+            hint = f"; or map it with task={{{shown(texts[0])}: 'reach'}}, for example" if texts else ""
+            raise ValueError(f"{unknown_name('task', texts[0] if texts else None, suite.tasks)}{hint}")
         names[texts] = found[0]
     return [names[texts] for texts in table.tasks]
 
@@ -271,12 +251,10 @@ def describe(
     count = Counter(names)
     if episodes_per_task is None and len({*count.values()}) > 1:
         counts = ", ".join(f"{number} of {name}" for name, number in sorted(count.items())[:5])
-        hint = f"episodes_per_task must be set, for example to {min(count.values())}"
-        raise ValueError(f"{hint}, because the tasks have different numbers of episodes: {counts}")
+        raise ValueError(f"episodes_per_task must be given, because tasks have different numbers of episodes: {counts}")
     each = min(count.values()) if episodes_per_task is None else episodes_per_task
-    if short := [name for name, number in count.items() if number < each]:
-        limit = f"at most {count[short[0]]}, the number of episodes of {short[0]!r}"
-        raise ValueError(f"episodes_per_task must be {limit}, got {each}")
+    if each > min(count.values()):
+        raise ValueError(f"episodes_per_task must be at most {min(count.values())} for all tasks, got {each}")
     spans: dict[str, list[tuple[int, int]]] = {name: [] for name in sorted(count)}
     for name, span in zip(names, table.spans(), strict=True):
         spans[name].append(span)

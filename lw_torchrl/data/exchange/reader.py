@@ -87,26 +87,18 @@ def stored_bytes(paths: Iterable[Path]) -> int:
 
 
 class Files:
-    """The episodes that :func:`read_parquet` or :func:`read_hdf5` reads, and the columns to read.
-
-    Attributes:
-        widths: the number of values per row of each column to read.
-        allowed: the number of bytes that may still be read.
-        columns, sources: the columns that were read, and the names of these columns in the files.
-        unfit: for each column whose size does not fit, the column's name in the files.
-        lengths, tasks: the number of rows and the possible task names of each episode.
-        ends_known: whether the files state where episodes end.
-        notes: messages about data that the files lack.
-    """
+    """The episodes that :func:`read_parquet` or :func:`read_hdf5` reads, and the columns to read."""
 
     def __init__(self, widths: Mapping[str, int], allowed: int) -> None:
-        self.widths, self.allowed = widths, allowed
+        self.widths = widths  # the number of values per row of each column to read
+        self.allowed = allowed  # the number of bytes that may still be read
         self.columns: dict[str, Array] = {}
-        self.sources: dict[str, str] = {}
-        self.unfit: dict[str, str] = {}
+        self.sources: dict[str, str] = {}  # for each column that was read, its name in the files
+        self.unfit: dict[str, str] = {}  # for each column whose size does not fit, its name in the files
         self.lengths: list[int] = []
-        self.tasks: list[list[str]] = []
-        self.ends_known, self.notes = True, list[str]()
+        self.tasks: list[list[str]] = []  # the possible task names of each episode
+        self.ends_known = True  # whether the files state where episodes end
+        self.notes: list[str] = []  # messages about data that the files lack
 
     def reserve(self, name: str, size: float) -> None:
         """Raise :class:`Refused` if a column of ``size`` bytes is too large for the files."""
@@ -130,9 +122,7 @@ class Files:
         if column not in self.sources:
             sizes = {name: f"{width:g}" if width % 1 == 0 else "different sizes" for name, width in seen.items()}
             listed = ", ".join(f"{name} ({size})" for name, size in [*sizes.items()][:20]) or "unknown"
-            raise Refused(
-                f"column {column!r} needs {self.widths[column]} numbers in each row; the columns are {listed}"
-            )
+            raise Refused(f"column {column!r} needs {self.widths[column]} numbers per row; the columns are {listed}")
 
     def save(self, out: Path) -> None:
         """Write the columns and the description."""
@@ -150,6 +140,7 @@ class Files:
 
 def read_parquet(source: Path, files: Files) -> None:
     """Read a LeRobot dataset, or parquet files with LeRobot's columns."""
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     meta = source / "meta"
@@ -174,9 +165,8 @@ def read_parquet(source: Path, files: Files) -> None:
     files.require("action", seen)
     files.require("observation", seen)
     index = [name for name in ("episode_index", "frame_index", "task_index") if values.get(name) == rows]
-    plain = [
-        name for name in TASK_NAMES if all(columns.get(name, ("",))[0] == name for _, columns in leaves)
-    ]  # no lists
+    # The path of a column that is not a list equals its name.
+    plain = [name for name in TASK_NAMES if all(columns.get(name, ("",))[0] == name for _, columns in leaves)]
     texts = [name for name in plain if values[name] == rows and name not in index]
     parts: dict[str, list[Array]] = {name: [] for name in (*chosen, *index, *texts)}
     for name in parts:
@@ -190,7 +180,8 @@ def read_parquet(source: Path, files: Files) -> None:
         for name in [*parts]:
             column = read[name].combine_chunks()
             try:
-                parts[name].append(_strings(column) if name in texts else _numbers(name, column))
+                strings = np.array(column.cast(pa.string()).to_pylist(), dtype=object) if name in texts else None
+                parts[name].append(_numbers(name, column) if strings is None else strings)
             except Refused:
                 if chosen.get(name, "action") in ("action", "observation"):
                     raise
@@ -238,13 +229,6 @@ def _numbers(name: str, column: Any) -> Array:
     if values.dtype.kind not in "biuf":
         raise Refused(f"{name} must hold numbers, but holds values of type {column.type}")
     return values if len(values) == rows else values.reshape(rows, -1)
-
-
-def _strings(column: Any) -> Array:
-    """Convert an Arrow column to strings (R,); absent strings become None."""
-    import pyarrow as pa
-
-    return np.array(column.cast(pa.string()).to_pylist(), dtype=object)
 
 
 def _whole(name: str, column: Array) -> Array:
@@ -379,8 +363,9 @@ def _groups(file: Any) -> Iterator[tuple[Any, bool]]:
     import h5py
 
     for container in [file["data"], file] if isinstance(file.get("data"), h5py.Group) else [file]:
-        numbered = [name for name in container if re.search(r"\d$", name)]
-        groups = [container[name] for name in sorted(numbered, key=natural) if _is_group(container, name)]
+        links = ((name, container.get(name, getlink=True)) for name in sorted(container, key=natural))
+        own = [name for name, link in links if re.search(r"\d$", name) and not isinstance(link, h5py.ExternalLink)]
+        groups = [container[name] for name in own if container.get(name, getclass=True) is h5py.Group]
         if groups:
             if lacking := [group.name for group in groups if not _has_actions(group)]:
                 if len(lacking) == len(groups):
@@ -391,13 +376,6 @@ def _groups(file: Any) -> Iterator[tuple[Any, bool]]:
         if _has_actions(container):
             yield container, False
             return
-
-
-def _is_group(container: Any, name: str) -> bool:
-    import h5py
-
-    link = container.get(name, getlink=True)
-    return not isinstance(link, h5py.ExternalLink) and container.get(name, getclass=True) is h5py.Group
 
 
 def _has_actions(group: Any) -> bool:
@@ -496,13 +474,11 @@ def main(source: Path, out: Path, is_hdf5: bool, allowed: int, widths: Mapping[s
         _report(out, refused="the files declare more numbers than files of this size may hold")
     except OSError as error:
         if error.errno is None:
-            _report(out, corrupted=f"{type(error).__name__}: {error}")
+            _report(out, refused=f"the files are corrupted ({error!r})")
         else:
             _report(out, system=[error.errno, error.strerror, str(error.filename or source)])
-    except (AttributeError, IndexError, TypeError) as error:  # an entry of the metadata has another type
-        _report(out, refused=f"the files cannot be read ({type(error).__name__}: {error})")
     except Exception as error:  # pyarrow and h5py raise many kinds of errors for corrupted files
-        _report(out, corrupted=f"{type(error).__name__}: {error}")
+        _report(out, refused=f"the files are corrupted ({error!r})")
 
 
 if __name__ == "__main__":
