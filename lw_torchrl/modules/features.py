@@ -52,8 +52,7 @@ class Features(TensorDictModuleBase):
     @property
     def observation_key(self) -> NestedKey:
         """The key of the observation."""
-        key: NestedKey = self.in_keys[0]
-        return key
+        return self.in_keys[0]
 
     def compute(self, tensordict: TensorDictBase) -> Tensor:
         """Return the features (B, F) without noise."""
@@ -133,10 +132,8 @@ class ObservationFeatures(Features):
         if layout == self.layout:
             return self
         if self.kind not in TRANSFERS:
-            raise ValueError(
-                f"features {self.kind!r} of layout {self.layout.name!r} do not transfer to {layout.name!r}; use "
-                f"RoleFeatures and ObservationFeatures of kind {' or '.join(map(repr, TRANSFERS))}"
-            )
+            kinds = " or ".join(map(repr, TRANSFERS))
+            raise ValueError(f"features {self.kind!r} do not transfer to {layout.name!r}; use RoleFeatures or {kinds}")
         other = ObservationFeatures(**{**self.config, "layout": layout})
         other.mean, other.std = self.mean, self.std
         return in_mode_of(self, other)

@@ -113,8 +113,7 @@ class SkillMixer(Part):
 
     def latents(self) -> Tensor:
         """Return the latents (K, D) of the distinct skills."""
-        latents: Tensor = self.encoder(self.vectors)
-        return latents
+        return self.encoder(self.vectors)
 
     def per_skill(self, weights: Tensor, task_id: Tensor, latents: Tensor) -> Tensor:
         """Return the attention over the K distinct skills (..., K), given the attention over plan steps (..., S)."""

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite
 from torchrl.modules import MLP as TorchRLMLP
 
-from lw_torchrl._util.checks import Count
+from lw_torchrl._util.checks import Count, check_value
 from lw_torchrl._util.keys import Keys, any_arguments, as_keys, check_apart, last_name
 
 if TYPE_CHECKING:
@@ -187,15 +187,10 @@ class NamedParts(RenamedInputs, TensorDictSequential):
         if name not in parts:
             # A misspelt part name would create an attribute that nothing uses. Users' subclasses may add modules.
             if parts and isinstance(value, nn.Module) and type(self).__module__.startswith("lw_torchrl."):
-                available = f"{type(self).__name__} has the parts {', '.join(parts)}"
-                raise AttributeError(
-                    f"{available}, but no {name}; set a module of a part as in actor.mixer.encoder = ..."
-                )
+                raise AttributeError(f"{type(self).__name__} has no part {name}, only {', '.join(parts)}")
             super().__setattr__(name, value)
             return
-        if not isinstance(value, nn.Module):
-            raise TypeError(f"{name} must be a module, got {value!r:.80}")
-        part = self.as_part(name, value)
+        part = self.as_part(name, check_value(name, value, nn.Module))
         check_same_plans({**parts, name: part})
         parts[name] = part
         self.plans, self.tasks, self.layout = trunk_attributes(self)
@@ -209,10 +204,7 @@ class NamedParts(RenamedInputs, TensorDictSequential):
     @out_keys.setter
     def out_keys(self, keys: Keys) -> None:
         if list(keys) != self._complete_out_keys:
-            raise ValueError(
-                f"out_keys of a {type(self).__name__} cannot be assigned, got {list(keys)}; pass out_keys= to the "
-                "constructor, or use select_out_keys to write fewer keys"
-            )
+            raise ValueError(f"out_keys cannot be assigned; use select_out_keys, or the constructor; got {list(keys)}")
         self._out_keys = self._out_keys_apparent = list(keys)
 
     def _update_keys(self) -> None:

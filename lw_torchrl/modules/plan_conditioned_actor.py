@@ -267,11 +267,8 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         """
         old = getattr(actor.decoder, "network", None)
         if not isinstance(old, MLPDecoder):
-            raise TypeError(
-                f"stochastic() needs an actor with an MLPDecoder, got {type(old or actor.decoder).__name__}; otherwise "
-                "use a decoder that returns mean and standard deviation, with out_keys=['loc', 'scale'], and wrap "
-                "the actor in torchrl.modules.ProbabilisticActor"
-            )
+            kind = type(old or actor.decoder).__name__
+            raise TypeError(f"stochastic() needs an MLPDecoder, got {kind}; or use torchrl.modules.ProbabilisticActor")
         if distribution == "tanh_normal" and not old.squash:
             raise ValueError("distribution 'tanh_normal' squashes actions, but this actor does not; use 'normal'")
         options = {**old.config, "squash": distribution == "normal" and old.squash, "init_std": init_std}

@@ -86,15 +86,12 @@ class ActorEnsemble(_Wrapper):
     @typed
     def __init__(self, members: Sequence[TensorDictModuleBase]) -> None:
         super().__init__()
-        if not members:
-            raise ValueError("members must be at least one actor, got none")
-        first = members[0]
-        if any(_fingerprint(member) != _fingerprint(first) for member in members):
-            raise ValueError("members must have the same plans")
-        if any(tasks_of(member) != tasks_of(first) for member in members):
-            raise ValueError("members must have the same tasks")
+        if len({(_fingerprint(member), tasks_of(member)) for member in members}) != 1:
+            raise ValueError(
+                f"members must be one or more actors with equal plans and tasks, got {len(members)} actors"
+            )
         self.members: Any = nn.ModuleList(members)
-        written = [key for key in first.out_keys if last_name(key) in ("action", "skill_weights")]
+        written = [key for key in members[0].out_keys if last_name(key) in ("action", "skill_weights")]
         self._written: list[NestedKey] = sorted(written, key=last_name)
         self._wrap(members, self._written)
 

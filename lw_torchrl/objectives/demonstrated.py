@@ -39,8 +39,6 @@ class _ImitatesDemonstrations(_Loss):
         reduction: Reduction | None = None,
         **options: Any,
     ) -> None:
-        if "alpha" in self._fixed and "alpha" in options:
-            raise ValueError("alpha is fixed to 1; use bc_weight to weight the imitation loss")
         spec = options.get("action_spec")
         if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:
             got = f"shape {tuple(spec.shape)}; use env.action_spec_unbatched"

@@ -165,9 +165,7 @@ class ExpectileValueLoss(LossModule):
         is_ensemble = len(getattr(network, "heads", ())) > 1
         if unravel_key(key) not in network.out_keys or (is_ensemble and key != keys.values):
             needed = keys.values if is_ensemble else keys.value
-            raise ValueError(
-                f"value_network must write {needed!r}, but writes {network.out_keys}; use loss.set_keys(...)"
-            )
+            raise ValueError(f"value_network must write {needed!r}, got {network.out_keys}; use loss.set_keys(...)")
         with params.to_module(network, preserve_module_state=False):
             # Pass all keys, because networks also read optional keys: RandomYaw's angle, qaf_plan.
             (values,) = read(network(tensordict.copy()), [key])
@@ -296,10 +294,9 @@ def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
         >>> standardize_by_task(torch.tensor([[1.0], [3.0], [7.0]]), torch.tensor([4, 4, 9])).tolist()
         [[-1.0], [1.0], [0.0]]
     """
-    if advantage.dtype != torch.float32 or advantage.ndim != 2 or advantage.shape[1] != 1:
-        raise ValueError(f"advantage must be (R, 1) float32, got {tuple(advantage.shape)} {advantage.dtype}")
-    if task_id.dtype != torch.int64 or task_id.shape != advantage.shape[:1]:
-        raise ValueError(f"task_id must be ({len(advantage)},) int64, got {tuple(task_id.shape)} {task_id.dtype}")
+    given = [(tuple(tensor.shape), tensor.dtype) for tensor in (advantage, task_id)]
+    if given != [((*task_id.shape[:1], 1), torch.float32), (tuple(task_id.shape[:1]), torch.int64)]:
+        raise ValueError(f"advantage must be (R, 1) float32 and task_id (R,) int64, got {given}")
     check_finite("advantage", advantage)
     standardized = torch.zeros_like(advantage)
     for task in task_id.unique():

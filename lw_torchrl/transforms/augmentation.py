@@ -13,15 +13,16 @@ from torchrl.envs import Transform
 
 from lw_torchrl._util.checks import Probability, Scale, typed
 from lw_torchrl._util.devices import plain
-from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside, read
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, read
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.roles import StepRole
-from lw_torchrl.language.task_index import PlanTables, answers_of
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.tasks import role_object
+from lw_torchrl.transforms.qaf import read_truth
 
 # A plan step with more attention is active. If any condition is true, a step with a false condition gets about 1e-4.
-ACTIVE = 0.01
+ACTIVE_WEIGHT = 0.01
 
 
 class Augmentation(Transform):
@@ -59,21 +60,16 @@ class PlanAugmentation(Augmentation):
     def answers(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor, Tensor]:
         """Return ``qaf`` (B, S), row indices of the tables (B,) int64, and a mask (B, S) bool of the steps that are
         available in the current turn (see :class:`FallbackTurns`)."""
-        qaf, task_id = read(tensordict, keys)
-        qaf, rows = answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), self._tables)
-        if qaf.shape != (shape := (*rows.shape, self._tables.mask.shape[-1])):
-            raise ValueError(f"qaf must have shape {shape}, one column for each step of plans, got {tuple(qaf.shape)}")
+        qaf, rows = read_truth(tensordict, keys, self._tables)
         turn = tensordict.get("turn", None)
         steps = self.table("steps", rows.device)
         return qaf, rows, steps[rows, torch.zeros_like(rows) if turn is None else turn % steps.shape[1]]
 
     def active(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor]:
-        """Return a mask of the active plan steps (B, S) bool, and, for each batch row, the index of its row in the
-        query tables (B,) int64.
-        """
+        """Return a mask of the active plan steps (B, S) bool, and the row of each task in the tables (B,) int64."""
         qaf, rows, steps = self.answers(tensordict, keys)
         weights = (10.0 * qaf.to(torch.float32) - 5.0).masked_fill(~steps, -torch.inf).softmax(-1)
-        return weights > ACTIVE, rows
+        return weights > ACTIVE_WEIGHT, rows
 
 
 class SwapUnmentioned(PlanAugmentation):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import torch
 from tensordict import unravel_key
@@ -12,6 +12,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
+
+State = TypeVar("State")
 
 
 def base_env(transform: Transform) -> EnvBase | None:
@@ -113,12 +115,19 @@ class KeepsEnvState(EpisodeTransform):
             flags[:] = [0] * len(flags)
 
 
-def reset_rows(before: Tensor | None, now: Tensor, begun: Tensor | None, more: int = 0) -> Tensor:
-    """Return ``now`` (B, ...) in rows where ``begun`` (B bool, or None for all rows) is true, and ``before`` elsewhere.
+def begun(state: State | None) -> State:
+    """Return a transform's ``state`` of the episodes; raise a :class:`RuntimeError` if a reset has not yet set it."""
+    if state is None:
+        raise RuntimeError("no episode has begun: reset the environment before the first step")
+    return state
+
+
+def reset_rows(before: Tensor | None, now: Tensor, which: Tensor | None, more: int = 0) -> Tensor:
+    """Return ``now`` (B, ...) in rows where ``which`` (B bool, or None for all rows) is true, and ``before`` elsewhere.
 
     The tensors have ``more`` dimensions in addition to the batch dimensions B.
     """
-    if before is None or begun is None or before.shape != now.shape:
+    if before is None or which is None or before.shape != now.shape:
         return now
     shape = (*now.shape[: now.dim() - more], *[1] * more)
-    return torch.where(begun.reshape(shape), now, before)
+    return torch.where(which.reshape(shape), now, before)

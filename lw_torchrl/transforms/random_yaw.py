@@ -6,9 +6,9 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import Probability, Scale, missing_keys, typed
+from lw_torchrl._util.checks import Probability, Scale, typed
 from lw_torchrl._util.devices import plain
-from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside, read
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans
 from lw_torchrl.language.roles import StepRole
@@ -162,9 +162,7 @@ class RandomYaw(PlanAugmentation):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = tensordict.copy()  # replay[:] may return the storage itself
         (source, target), *actions = zip(self.in_keys, self.out_keys, strict=True)
-        observation = tensordict.get(source, None)
-        if observation is None or tensordict.get(actions[0][0], None) is None:
-            raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys[:2]))
+        observation, _ = read(tensordict, self.in_keys[:2])
         angle = self._angle(tensordict, observation)
         tilt = self._tilt(tensordict) if self.tilt else None
         old_yaw, old_tilt = (tensordict.get(key_beside(source, ending), None) for ending in ("_yaw", "_tilt"))

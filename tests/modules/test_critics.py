@@ -28,10 +28,7 @@ def test_ensemble_value_is_its_minimum(make, kind, shape):
     assert set(output.keys()) == {*rows.keys(), *critic.out_keys}, "what the trunk writes stays inside"
     assert (
         critic.out_keys
-        == {
-            Value: ["state_value", "state_values"],
-            QValue: ["state_action_value", "state_action_values"],
-        }[make]
+        == {Value: ["state_value", "state_values"], QValue: ["state_action_value", "state_action_values"]}[make]
     )
 
 

@@ -13,13 +13,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import lw_torchrl as lw
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules import (
-    ActorEnsemble,
-    FocusFeatures,
-    PlanAttention,
-    RoleFeatures,
-    transform_of,
-)
+from lw_torchrl.modules import ActorEnsemble, FocusFeatures, PlanAttention, RoleFeatures, transform_of
 from lw_torchrl.training.normalization import fit_normalization
 
 ZERO_SHOT = lw.canonical_plans(lw.load_plans("MT50", skills="MT10"))

@@ -2,13 +2,7 @@
 
 import pytest
 import torch
-from small_actors import (
-    CANONICAL,
-    make_actor,
-    make_descriptor,
-    make_role_actor,
-    make_rows,
-)
+from small_actors import CANONICAL, make_actor, make_descriptor, make_role_actor, make_rows
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.envs import ExplorationType, set_exploration_type
 

@@ -2,15 +2,7 @@
 
 import pytest
 import torch
-from small_actors import (
-    CANONICAL,
-    action_of,
-    make_actor,
-    make_descriptor,
-    make_role_actor,
-    make_rows,
-    rows_for,
-)
+from small_actors import CANONICAL, action_of, make_actor, make_descriptor, make_role_actor, make_rows, rows_for
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -207,9 +199,7 @@ def test_full_displacement_stays_full_or_keeps_its_metres():
         torch.testing.assert_close(output[:, fetch.layout.displaced("test")], expected)
         assert {id(one) for one in moved.parameters()} == {id(one) for one in actor.parameters()}
     state = TensorDict(
-        observation=torch.rand(3, fetch.layout.size),
-        task_id=torch.full((3,), lw.task_id("fetch/push")),
-        batch_size=[3],
+        observation=torch.rand(3, fetch.layout.size), task_id=torch.full((3,), lw.task_id("fetch/push")), batch_size=[3]
     )
     assert action_of(moved, lw.QAFTransform(fetch)(state)).abs().max() <= 1
 

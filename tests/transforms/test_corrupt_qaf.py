@@ -46,12 +46,7 @@ def expected(exact, task, episode, flip=0.0, every=1, delay=0, seed=0) -> Tensor
     return torch.nn.functional.pad(shown, (0, PLANS.num_steps - len(steps)))
 
 
-CORRUPTIONS = [
-    {"flip": 0.3},
-    {"delay": 3},
-    {"every": 3, "delay": 2},
-    {"flip": 0.1, "every": 2, "delay": 3, "seed": 11},
-]
+CORRUPTIONS = [{"flip": 0.3}, {"delay": 3}, {"every": 3, "delay": 2}, {"flip": 0.1, "every": 2, "delay": 3, "seed": 11}]
 masks = st.lists(st.booleans(), min_size=ROWS, max_size=ROWS).map(torch.tensor)
 moves = st.lists(st.tuples(st.sampled_from(["step", "step", "step", "reset"]), masks), max_size=20)
 
