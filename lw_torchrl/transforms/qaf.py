@@ -157,7 +157,8 @@ class QAFTransform(KeepsEnvState):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         before = read(tensordict, self.out_keys[2:])[0] if self.program.num_latches else None  # a reset writes them
-        self._write(next_tensordict, *read(next_tensordict, self.in_keys[1:]), before)
+        (task_id,) = read(next_tensordict, self.in_keys[1:])
+        self._write(next_tensordict, task_id, before)
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -312,18 +313,18 @@ class CorruptQAF(EpisodeTransform):
         due = moved & (self._steps % self.every == 0)
         place = torch.arange(self._places, device=due.device) == self._place(self._steps).unsqueeze(-1)
         truth = next_tensordict.get(self.in_keys[0]).unsqueeze(-2)
-        self._answers = torch.where((place & due.unsqueeze(-1)).unsqueeze(-1), truth, self._answers)
+        self._answers = torch.where((place & due.unsqueeze(-1)).unsqueeze(-1), truth, begun(self._answers))
         return self._show(next_tensordict)
 
     def _place(self, step: Tensor) -> Tensor:
         return step // self.every % self._places
 
     def _show(self, tensordict: TensorDictBase) -> TensorDictBase:
-        assert self._answers is not None
-        place = self._place((begun(self._steps) - self.delay).clamp(min=0))[..., None, None]
-        answers = self._answers.gather(-2, place.expand(*place.shape[:-1], self._answers.shape[-1])).squeeze(-2)
+        steps, answers = begun(self._steps), begun(self._answers)
+        place = self._place((steps - self.delay).clamp(min=0))[..., None, None]
+        answers = answers.gather(-2, place.expand(*place.shape[:-1], answers.shape[-1])).squeeze(-2)
         if self.flip:
-            wrong = self._real & (_uniform(self._key, begun(self._steps), self._real.shape[-1]) < self.flip)
+            wrong = self._real & (_uniform(self._key, steps, self._real.shape[-1]) < self.flip)
             answers = answers ^ wrong if answers.dtype == torch.bool else torch.where(wrong, 1 - answers, answers)
         return tensordict.set(self.in_keys[0], answers)
 

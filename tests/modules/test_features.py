@@ -43,18 +43,6 @@ def test_differences_to_an_absent_object_are_zero():
     assert not output[1].abs().sum(-1).eq(0).any()
 
 
-@pytest.mark.parametrize(
-    ("kind", "width"), [("raw", 39), ("differences", 56), ("relative", 54), ("both", 95), ("opening", 1), ("none", 0)]
-)
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
-def test_width_of_every_kind_for_any_leading_shape(kind, width, shape):
-    features = ObservationFeatures(kind)
-    output = features(random_observation(*shape))
-    assert features.width == width
-    assert output.shape == (*shape, width)
-    assert output.dtype == torch.float32
-
-
 @pytest.mark.parametrize(("kind", "same"), [("raw", False), ("differences", False), ("relative", True)])
 def test_relative_features_do_not_show_where_the_scene_is(kind, same):
     here = random_observation(20)

@@ -104,10 +104,3 @@ def test_compiled_actor_refuses_at_run_time():
     wrong["observation"][1, 2] = torch.nan
     with pytest.raises(RuntimeError, match="finite numbers"):
         act(wrong)
-
-
-def test_unknown_task_under_vmap_is_refused():
-    actor = lw.modules.DescriptorConditionedActor(["reach", "push"]).eval()
-    data = TensorDict(observation=torch.zeros(3, 39), task_id=torch.full((3,), lw.task_id("soccer")))
-    with pytest.raises((IndexError, RuntimeError)):
-        torch.vmap(lambda row: actor(row)["action"])(data.auto_batch_size_())

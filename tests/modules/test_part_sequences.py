@@ -2,6 +2,8 @@
 
 import pytest
 import torch
+from small_actors import letters
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
@@ -80,12 +82,13 @@ def test_renamed_keys_of_an_ensemble_skip_what_a_member_writes_itself():
     assert ensemble.members[1].in_keys[0] == "truth"
 
 
-def test_with_plans_keeps_dtype_and_modes():
-    actor = lw.PlanConditionedActor(PLANS).double().train()
+def test_with_plans_keeps_dtype_modes_statistics_and_text_encoder():
+    actor = lw.PlanConditionedActor(PLANS, text_encoder=letters).double().train()
     actor.decoder.eval()
     other = actor.with_plans(REVERSED)
-    assert other.training
-    assert not actor.decoder.training
+    assert (other.training, actor.decoder.training, other.mixer.text_encoder) == (True, False, letters)
+    other.features.fit(TensorDict(observation=torch.rand(50, 39), batch_size=[50]))
+    assert torch.equal(other.features.mean, actor.features.mean)
     observation = torch.zeros(2, 39, dtype=torch.float64)
     assert other(**{**inputs(), "observation": observation})[-1].dtype == torch.float64
 
