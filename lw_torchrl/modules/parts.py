@@ -29,10 +29,7 @@ Width = Count | Sequence[Count]
 
 
 class MLP(TorchRLMLP):
-    """TorchRL's MLP with ReLU, which infers its input width from the first input and concatenates several inputs.
-
-    A sequence of widths sets the hidden layers and overrides ``depth``.
-    """
+    """TorchRL's MLP with ReLU, which concatenates its inputs; a sequence of widths overrides ``depth``."""
 
     def __init__(self, out_features: int, *, width: Width = 256, depth: int = 3, layer_norm: bool = False) -> None:
         widths = list(width) if isinstance(width, Sequence) else [width] * depth
@@ -56,10 +53,7 @@ def materialize(module: nn.Module, *inputs: Tensor) -> None:
 
 @torch.no_grad()
 def probe(module: nn.Module, example: Tensor) -> Any:
-    """Return a module's output for an example, which is moved to the module's device.
-
-    The global random state is left unchanged.
-    """
+    """Return a module's output for an example on the module's device, without changing the global random state."""
     weight = next(module.parameters(), None)
     with evaluating(module), torch.random.fork_rng(devices=[]):
         return module(example if weight is None else example.to(weight.device))
@@ -106,11 +100,8 @@ class Part(TensorDictModuleBase):
 
 
 class RenamedInputs(TensorDictModuleBase):
-    """A base class of modules with assignable ``in_keys``.
-
-    Assigning keys also renames the keys that the submodules read. Other modules that share these submodules keep their
-    own keys.
-    """
+    """A base class of modules with assignable ``in_keys``: new keys also rename the keys that the submodules read, but
+    not the keys of other modules that share these submodules."""
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -123,8 +114,7 @@ class RenamedInputs(TensorDictModuleBase):
         if before is not None:  # false in the constructor, where the parts already read these keys
             keys = as_keys("in_keys", keys, list(map(str, before)))
             check_apart(keys, self.out_keys_source)
-            renamed = dict(zip(before, keys, strict=True))
-            _rename_parts(self, renamed, {})
+            _rename_parts(self, dict(zip(before, keys, strict=True)), {})
         self._in_keys = list(keys)
 
 
@@ -147,10 +137,8 @@ def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[A
 def _rename_parts(
     module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool = False
 ) -> None:
-    """Replace a module's parts with copies that read renamed keys.
-
-    If the parts run ``in_order``, a key that an earlier part writes is not renamed in the parts that follow it.
-    """
+    """Replace a module's parts with copies that read renamed keys; if the parts run ``in_order``, a key that an
+    earlier part writes is not renamed in later parts."""
     in_sequence, remaining, parts = isinstance(module, TensorDictSequential), renamed, {}
     for name, part in module._modules.items():
         parts[name] = _reading(part, remaining, copies, in_sequence)
@@ -236,11 +224,8 @@ def _plans_inside(part: nn.Module) -> Any:
 
 
 def follow(part: Any, plans: AnyPlans) -> Any:
-    """Return a part that follows ``plans`` with the networks of ``part``; return a part without plans unchanged.
-
-    Raises:
-        TypeError: the part follows plans but has no method ``with_plans``.
-    """
+    """Return a part that follows ``plans`` with the networks of ``part``; return a part without plans unchanged. Raise
+    a :class:`TypeError` if the part follows plans but has no method ``with_plans``."""
     if hasattr(part, "with_plans"):
         return part.with_plans(plans)
     if isinstance(part, nn.Module) and _plans_inside(part) is None:
@@ -260,9 +245,7 @@ def _named_parts(trunk: TensorDictSequential) -> list[Any]:
 
 
 def trunk_attributes(trunk: TensorDictSequential) -> tuple[Any, Any, Layout]:
-    """Find the first part of a trunk that has a layout, and return its ``(plans, tasks, layout)``; ``plans`` and
-    ``tasks`` are None if the part has none.
-    """
+    """Return ``(plans, tasks, layout)`` of a trunk's first part with a layout; None for plans or tasks it lacks."""
     part = next((part for part in _named_parts(trunk) if hasattr(part, "layout")), None)
     if part is None:
         raise ValueError("trunk must have a part with a layout: PlanAttention, SkillMixer, TaskLatent or features")

@@ -239,7 +239,6 @@ class ClauseEvaluator(QueryEvaluator):
 
     def code(self, clauses: Sequence[tuple[Task, Clause]]) -> Clauses:
         """Encode clauses (G,) of any tasks as tensors. Without ``names``, every object has index 0."""
-        predicate_index = {name: number for number, name in enumerate(self.predicates)}
         name_index = {name: number for number, name in enumerate(self.names)}
         for task, clause in clauses:
             where = f"of {str(clause)!r}, in {task.name}"
@@ -251,7 +250,7 @@ class ClauseEvaluator(QueryEvaluator):
             first=torch.tensor(first),
             second=torch.tensor(second),
             shift=torch.tensor(shift, dtype=torch.float32),
-            predicate=torch.tensor([predicate_index[clause.predicate] for _, clause in clauses]),
+            predicate=torch.tensor([self.predicates.index(clause.predicate) for _, clause in clauses]),
             negated=torch.tensor([clause.negated for _, clause in clauses]),
             subject=torch.tensor([name_index.get(clause.subject, 0) for _, clause in clauses]),
             object=torch.tensor([name_index.get(clause.object or "", len(self.names)) for _, clause in clauses]),
@@ -318,11 +317,8 @@ def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
 
 
 class ClauseNetwork(nn.Module):
-    """A network that maps clauses to logits.
-
-    A trunk encodes the difference of two positions. The logit is the dot product of the trunk's output and a learned
-    vector of the predicate, plus a bias. "not" flips the sign of the logit.
-    """
+    """A network that maps clauses to logits: the dot product of an MLP of the difference of two positions and a
+    learned vector of the predicate, plus a bias. "not" flips the sign."""
 
     numbers: int = 3  # components of a difference
 

@@ -127,9 +127,8 @@ def _compared(plan: ConditionalPlan) -> list[list[Pair]]:
 class FocusFeatures(_RelativePositions):
     """Relative positions of the objects that the conditions of the active plan steps compare.
 
-    A condition names the objects of its skill: "the gripper is above the handle and not near the handle". The same
-    features contain the handle's position relative to the gripper in one task and the puck's in another task, so the
-    policy can transfer its behavior between tasks.
+    The same features contain the handle's position relative to the gripper in one task and the puck's in another task,
+    so the policy can transfer its behavior between tasks.
 
     Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes
     ``features`` (B, 18). For each of two clauses, the first and the last with two objects, these are 9 numbers: the
@@ -157,13 +156,9 @@ class RoleFeatures(_RelativePositions):
     """Features of the active plan step: the target's position relative to the moved object, and the motion direction.
 
     "lower the gripper around the puck" and "... the mug" are the same motion in these features, so policies can
-    transfer it between tasks. The direction of "push the dial to the right" is to the right; that of "push it toward
-    the target location" is from the object to the goal. Offsets longer than 25 cm are shortened to 25 cm.
-
-    The point at which demonstrations touch an object, its *contact*, can differ from the observed position of the
-    object. :meth:`fit` computes the contacts from demonstrations, and the features use them as targets. In a task
-    without demonstrations, the target is the point that the plan names, and a carried object is first lifted to 15 cm
-    above the target, then lowered.
+    transfer it between tasks. Offsets longer than 25 cm are shortened to 25 cm. The targets are the points at which
+    demonstrations touch an object, its *contacts*, which :meth:`fit` computes. In a task without demonstrations, the
+    target is the point that the plan names, and a carried object is first lifted to 15 cm above the target.
 
     Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64, and the outputs
     of :class:`RandomYaw` and :class:`JitterTarget` if present; writes ``features`` (B, 12). These are the relative
@@ -248,9 +243,7 @@ class RoleFeatures(_RelativePositions):
         return other
 
     def share(self) -> None:
-        """Copy the contact points to all modules created by :meth:`with_plans`; call this method after changing the
-        buffers.
-        """
+        """Copy the contact points to all modules created by :meth:`with_plans`; call it after changing the buffers."""
         for other in self._sharing:
             if other is not self:
                 other._copy(self)

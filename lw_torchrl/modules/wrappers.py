@@ -60,8 +60,7 @@ class _ActionWrapper(_Wrapper):
 class ActorEnsemble(_Wrapper):
     """An ensemble that averages the actions of actors trained separately on the same demonstrations.
 
-    In states unlike the demonstrations, the members make different errors, which partly cancel in the mean, especially
-    if the members have different features or augmentations.
+    The members' errors partly cancel in the mean, especially if the members have different features or augmentations.
 
     Reads the input keys of the members; writes ``action`` (B, A) float32, and the mean ``skill_weights`` (B, S) float32
     if the members write them.
@@ -107,9 +106,7 @@ class ActorEnsemble(_Wrapper):
 
 
 class DecidedGripper(_ActionWrapper):
-    """A wrapper that opens or closes the gripper fully, except during training.
-
-    Half-open fingers knock objects over, and half-closed fingers drop objects.
+    """A wrapper that opens or closes the gripper fully, except during training; half-closed fingers drop objects.
 
     Reads and writes the actor's keys; the gripper effort in ``action`` (B, A) is -1 or 1.
 
@@ -156,8 +153,6 @@ def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -
 
 class DemonstratedActor(_Wrapper):
     """A policy that uses an actor without plans for demonstrated tasks, and an actor with plans for all other tasks.
-
-    Demonstrated tasks need no plan: with ten demonstrations, a plan does not increase the success rate.
 
     Reads the input keys of both actors; writes ``action`` (B, A) float32 and the other keys that ``others`` writes.
 

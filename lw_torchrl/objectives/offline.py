@@ -112,7 +112,7 @@ class ExpectileValueLoss(LossModule):
         """Set the estimator of the targets, and return this loss.
 
         Args:
-            value_type: an estimator, an estimator class, or ``ValueEstimators.TD0``; None for TD0. The other members of
+            value_type: an estimator, an estimator class, or ``ValueEstimators.TD0``; None for TD0. Other members of
                 ``ValueEstimators`` need rows in time order, and raise a :class:`NotImplementedError`.
             **hyperparams: ``gamma``, the discount per time step, by default 0.99.
         """
@@ -275,9 +275,7 @@ class AdvantageWeightedLoss(LossModule):
 
 @typed
 def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
-    """Standardize advantages to mean 0 and standard deviation 1 over the rows of each task.
-
-    Without standardization, tasks with large rewards would get all the weight.
+    """Standardize advantages to mean 0 and standard deviation 1 over each task's rows, to weight tasks equally.
 
     Args:
         advantage: (R, 1) float32, finite.

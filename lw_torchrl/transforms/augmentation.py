@@ -43,10 +43,7 @@ class Augmentation(Transform):
 
 
 class PlanAugmentation(Augmentation):
-    """A base class of augmentations that depend on which steps of a row's plan are active.
-
-    A plan step is active if its attention weight is above 0.01 (see :class:`~lw_torchrl.modules.PlanAttention`).
-    """
+    """A base class of augmentations that depend on a row's active plan steps, whose attention is above 0.01."""
 
     steps: Tensor
 
@@ -75,9 +72,8 @@ class PlanAugmentation(Augmentation):
 class SwapUnmentioned(PlanAugmentation):
     """An augmentation that gives each object not mentioned by an active plan step its position in a random row.
 
-    This keeps a policy from relying on these objects. A plan step mentions an object, or the goal, if the step's
-    condition or skill names it. Use this transform in a replay buffer, after a :class:`QAFTransform`, which must see
-    the unchanged scene.
+    A plan step mentions an object, or the goal, if its condition or skill names it. For replay buffers, after a
+    :class:`QAFTransform`, which must see the unchanged scene.
 
     Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); changes ``observation`` (B, D) and ``("next", "observation")`` in
     the same way. An object keeps its position if a step that is active in either observation mentions it. Draws from
@@ -159,8 +155,7 @@ class JitterTarget(PlanAugmentation):
     The offset models uncertain contact points: :class:`~lw_torchrl.modules.RoleFeatures` adds it to the target's
     position. For replay buffers, after a :class:`QAFTransform`. Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); writes
     ``target_offset`` (B, 3) float32, metres: normal noise of ``std`` in z and ``std / 2`` in x and y, or 0 without such
-    a step. Draws from PyTorch's global generator. TorchRL's losses, except BCLoss, do not pass the offset on to the
-    features, so :class:`~lw_torchrl.OfflineTrainer` rejects these losses.
+    a step. Draws from PyTorch's global generator. Of TorchRL's losses, only BCLoss passes the offset to the features.
 
     Args:
         plans: canonical plans, see :func:`~lw_torchrl.canonical_plans`, whose conditions ``qaf`` answers.

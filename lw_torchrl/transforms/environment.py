@@ -85,9 +85,7 @@ class KeepsEnvState(EpisodeTransform):
     """A base class of transforms that save the environment's state in their own ``state_dict``.
 
     TorchRL does not save this state, so a resumed Collector would run the same episodes again. After
-    ``load_state_dict``, reset the environment (``collector.reset()``). Around a ParallelEnv, such a transform does not
-    call ``ParallelEnv.load_state_dict``, which desynchronizes the workers in TorchRL 0.14.1 unless
-    ``use_buffers=False``.
+    ``load_state_dict``, reset the environment (``collector.reset()``).
     """
 
     def get_extra_state(self) -> Tensor:
@@ -124,9 +122,7 @@ def begun(state: State | None) -> State:
 
 def reset_rows(before: Tensor | None, now: Tensor, which: Tensor | None, more: int = 0) -> Tensor:
     """Return ``now`` (B, ...) in rows where ``which`` (B bool, or None for all rows) is true, and ``before`` elsewhere.
-
-    The tensors have ``more`` dimensions in addition to the batch dimensions B.
-    """
+    The tensors have ``more`` dimensions in addition to the batch dimensions B."""
     if before is None or which is None or before.shape != now.shape:
         return now
     shape = (*now.shape[: now.dim() - more], *[1] * more)

@@ -76,9 +76,7 @@ class CameraTransform(KeepsEnvState):
             raise TypeError(f"CameraTransform needs a LanguageWorldEnv (in each worker), got {name}")
 
     def _draw(self, which: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
-        """Re-render the images of the rows selected by the boolean mask ``which`` (N,), then write the images of all N
-        rows.
-        """
+        """Render the images of the rows ``which`` (N,) bool, and write the images of all N rows."""
         env: Any = base_env(self)
         rows = which.nonzero().flatten()
         if self._taken is None:

@@ -35,12 +35,8 @@ class _Number(NamedTuple):
 
 
 def read_truth(tensordict: TensorDictBase, keys: Keys, tables: PlanTables) -> tuple[Tensor, Tensor]:
-    """Return truth values (..., S), and each task's row (...) int64 in ``tables``; ``keys`` are those of both tensors.
-
-    Raises:
-        ValueError: a key is missing, the truth belongs to other plans or has another shape, or soft truth is outside
-            [0, 1].
-    """
+    """Return truth values (..., S), and each task's row (...) int64 in ``tables``, from the keys of ``qaf`` and
+    ``task_id``; raise a :class:`ValueError` for other plans' truth, another shape, or soft truth outside [0, 1]."""
     qaf, task_id = read(tensordict, keys)
     qaf, rows = answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), tables)
     if qaf.shape != (shape := (*rows.shape, tables.mask.shape[-1])):

@@ -16,8 +16,6 @@ from lw_torchrl.language.skills import has_direction
 from lw_torchrl.transforms.augmentation import PlanAugmentation, role_table
 
 _KEYS = ("observation", "action", "expert_action", "unclipped_action")
-
-
 _places: dict[tuple[tuple[int, ...], torch.device], Tensor] = {}
 
 
@@ -68,16 +66,14 @@ def random_rotations(number: int, device: torch.device | None = None) -> Tensor:
 class RandomYaw(PlanAugmentation):
     """An augmentation that rotates the positions and actions of each row by a random angle about the vertical axis.
 
-    A policy then learns to move toward the goal, rather than in the directions of the demonstrations. For replay
-    buffers, after a :class:`QAFTransform`, which must see the original scene, because "left of" has a direction.
+    For replay buffers, after a :class:`QAFTransform`, which must see the original scene: "left of" has a direction.
 
     Changes ``observation`` (B, 39), ``action`` (B, 4), and, if present, ``expert_action``, ``unclipped_action``
     (B, 4) and ``("next", "observation")``, all float32. Writes the angle in radians, ``observation_yaw`` (B,) float32,
     and ``("next", "observation_yaw")``, with which features also rotate constant positions. An action's horizontal
     displacement is shortened if it would leave [-1, 1]. Orientations are not rotated, so use features without
     orientations: "differences" or "relative". Angles are drawn from PyTorch's global generator; the angles of repeated
-    rotations add up. TorchRL's losses, except BCLoss, do not pass the angle on to the features, so
-    :class:`~lw_torchrl.OfflineTrainer` rejects these losses.
+    rotations add up. Of TorchRL's losses, only BCLoss passes the angle to the features.
 
     Args:
         scale: standard deviation of the angle, in radians; with 10, the angle is nearly uniform.

@@ -217,16 +217,6 @@ def test_loss_moves_to_a_gpu_and_back(name, condition):
     assert torch.equal(total(loss, batch), expected)
 
 
-@pytest.mark.parametrize("name", ["SAC", "IQL", "TD3", "CQL"])
-def test_loss_with_and_without_vmap_is_the_same(name):
-    with_vmap, _, _ = make_loss(name, "plan")
-    without, _, _ = make_loss(name, "plan")
-    without.load_state_dict(with_vmap.state_dict())
-    without.deactivate_vmap = True
-    without._make_vmap()
-    torch.testing.assert_close(total(without, make_batch()), total(with_vmap, make_batch()))
-
-
 CRITICS = ("DDPG", "TD3", "TD3+BC", "SAC", "REDQ", "CrossQ", "IQL", "CQL", "demonstrated TD3", "demonstrated SAC")
 
 

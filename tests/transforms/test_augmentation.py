@@ -169,17 +169,6 @@ MAKERS = {
 }
 
 
-@pytest.mark.parametrize("name", ["SwapUnmentioned", "JitterTarget"])
-def test_wider_qaf_of_the_same_plan_is_accepted(name):
-    task = min(CANONICAL, key=lambda task: len(CANONICAL[task].steps))
-    transform = getattr(lw.transforms, name)(Plans([CANONICAL[task]]), 0.5)
-    was = lw.QAFTransform(CANONICAL)(rows(task=task).exclude("qaf"))
-    now, expected = seeded(transform, was), seeded(getattr(lw.transforms, name)(CANONICAL, 0.5), was)
-    assert (now == expected).all()
-    with pytest.raises(ValueError, match="qaf"):
-        transform(was.exclude("qaf_plan"))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_augmentation_compiles_to_one_graph(name):

@@ -85,11 +85,8 @@ def test_soft_answers_are_corrupted_alike(options):
     parts = lw.QAFTransform(PLANS), soft, lw.transforms.CorruptQAF(PLANS, **options)
     env = TransformedEnv(RandomStates(ROWS), Compose(*parts))
     check_env_specs(env)
-    env, plain = (
-        TransformedEnv(RandomStates(ROWS), Compose(*(part.clone() for part in parts))),
-        both(RandomStates(ROWS), **options),
-    )
-    actual, expected = env.rollout(12)["qaf"], plain.rollout(12)["qaf"]
+    env.set_seed(0)
+    actual, expected = (each.rollout(12)["qaf"] for each in (env, both(RandomStates(ROWS), **options)))
     assert actual.dtype == torch.float32
     assert set(actual.unique().tolist()) == {0.25, 0.75}
     assert torch.equal(actual > 0.5, expected)
@@ -109,16 +106,6 @@ def test_flip_rate():
     fewer = fewer["qaf"] ^ fewer["exact"]
     assert 0 < fewer.sum() < wrong.sum()
     assert not (fewer & ~wrong).any(), "a larger probability flips all that a smaller one flips"
-
-
-def test_errors_in_late_steps_and_in_the_next_episode():
-    actual = both(RandomStates(2, length=70), flip=0.3, delay=1).rollout(75, break_when_any_done=False)
-    row = actual[0]
-    assert row["episode"][[0, -1]].tolist() == [0, 1]
-    for step in (0, 64, 69):
-        shown_answers = expected(list(row["exact"][: step + 1]), "push", 0, flip=0.3, delay=1)
-        assert torch.equal(row["qaf"][step], shown_answers)
-    assert torch.equal(row["qaf"][72], expected(list(row["exact"][70:73]), "push", 1, flip=0.3, delay=1))
 
 
 # --- wherever it is run --------------------------------------------------------------------------------------------

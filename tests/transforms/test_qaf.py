@@ -11,33 +11,14 @@ from torchrl.envs import Compose, StepCounter, TransformedEnv
 
 import lw_torchrl as lw
 
-# Conditions that an expert makes true and false; plans of 2, 3, 1 and 5 steps.
-PAIRS = {
-    "button-press-topdown": [
-        ("the gripper is not above the button", "move the gripper above the button"),
-        ("the gripper is above the button", "press the button"),
-    ],
-    "drawer-open": [
-        ("the gripper is not vertically aligned with the drawer handle", "move over the drawer handle"),
-        ("the gripper is near the drawer handle and the gripper is open", "pull the drawer handle"),
-        ("the gripper is closed", "open the gripper"),
-    ],
-    "push": [("the gripper is not near the puck", "move to the puck")],
-    "reach": [
-        ("the gripper is not near the reach target", "move the gripper to the reach target"),
-        ("the gripper is near the reach target", "hold still"),
-        ("the gripper is left of the reach target", "move to the right"),
-        ("the gripper is above the reach target", "move down"),
-        ("the gripper is not above the reach target", "move up"),
-    ],
-}
-TASKS = sorted(PAIRS)
+PLANS = lw.load_plans("MT10")
+TASKS = ["button-press-topdown", "door-open", "drawer-open", "push"]  # plans of 3, 5, 3 and 4 steps
 ROWS, STEPS, WIDTH = 6, 60, 5
 
 
 @pytest.fixture(scope="module")
 def few_plans() -> lw.Plans:
-    return lw.Plans([lw.ConditionalPlan.from_pairs(task, pairs) for task, pairs in PAIRS.items()])
+    return lw.Plans({task: PLANS[task] for task in TASKS})
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +41,10 @@ def answers(observation: Tensor, task_id: Tensor) -> Tensor:
     result = torch.zeros(len(states), WIDTH, dtype=torch.bool)
     for task in TASKS:
         rows = torch.nonzero(tasks == lw.task_id(task)).flatten()
-        for step, (condition, _) in enumerate(PAIRS[task]):
-            program = lw.QueryProgram({task: [condition]})
+        for number, step in enumerate(PLANS[task].steps):
+            program = lw.QueryProgram({task: [step.condition]})
             for row in rows.tolist():
-                result[row, step] = program(states[row : row + 1], tasks[row : row + 1]).item()
+                result[row, number] = program(states[row : row + 1], tasks[row : row + 1]).item()
     return result.reshape(*task_id.shape, WIDTH)
 
 
@@ -71,12 +52,10 @@ def test_answers_are_the_programs_at_every_step(rollout):
     expected = answers(rollout["observation"], rollout["task_id"])
     assert torch.equal(rollout["qaf"], expected)
     assert torch.equal(rollout["next", "qaf"], answers(rollout["next", "observation"], rollout["next", "task_id"]))
-    for task, pairs in PAIRS.items():
+    for task in TASKS:
         rows = rollout["qaf"][rollout["task_id"][:, 0] == lw.task_id(task)].flatten(0, 1)
-        assert not rows[:, len(pairs) :].any(), "padding is false"
-        if task != "reach":
-            assert rows[:, 0].any(), task
-            assert not rows[:, 0].all(), task
+        assert not rows[:, len(PLANS[task].steps) :].any(), "padding is false"
+        assert rows[:, 0].unique().tolist() == [False, True], task
     ended = rollout["next", "done"].squeeze(-1)
     assert ended.sum() == ROWS
     assert not torch.equal(rollout["qaf"][:, STEPS], rollout["next", "qaf"][:, STEPS - 1]), "a reset answers afresh"
@@ -135,7 +114,7 @@ def test_any_leading_shape(rollout, few_plans):
 
 
 def test_task_without_a_plan_is_refused_at_once(few_plans):
-    env = lw.LanguageWorldEnv(["reach", "sweep", "soccer"])
+    env = lw.LanguageWorldEnv(["push", "sweep", "soccer"])
     for build in (
         lambda: TransformedEnv(env, Compose(StepCounter(), Compose(lw.QAFTransform(few_plans)))),
         lambda: TransformedEnv(env, StepCounter()).append_transform(lw.QAFTransform(few_plans)),
