@@ -182,7 +182,8 @@ class NamedParts(RenamedInputs, TensorDictSequential):
         check_same_plans({**parts, name: part})
         parts[name] = part
         self.plans, self.tasks, self.layout = trunk_attributes(self)
-        self._update_keys()
+        self._in_keys, out_keys = self._compute_in_and_out_keys(list(self.module.values()))
+        self._out_keys = self._out_keys_apparent = self._complete_out_keys = out_keys
 
     @property
     def out_keys(self) -> list[NestedKey]:
@@ -194,10 +195,6 @@ class NamedParts(RenamedInputs, TensorDictSequential):
         if list(keys) != self._complete_out_keys:
             raise ValueError(f"out_keys cannot be assigned; use select_out_keys, or the constructor; got {list(keys)}")
         self._out_keys = self._out_keys_apparent = list(keys)
-
-    def _update_keys(self) -> None:
-        self._in_keys, out_keys = self._compute_in_and_out_keys(list(self.module.values()))
-        self._out_keys = self._out_keys_apparent = self._complete_out_keys = out_keys
 
 
 def action_spec(key: NestedKey, layout: Layout) -> Composite:

@@ -25,8 +25,11 @@ from lw_torchrl.transforms.qaf import read_truth
 ACTIVE_WEIGHT = 0.01
 
 
-class Augmentation(Transform):
-    """Base class for transforms that randomly change sampled rows. Using one in an environment raises a TypeError."""
+class PlanAugmentation(Transform):
+    """A base class of augmentations that depend on a row's active plan steps, whose attention is above 0.01. Using one
+    in an environment raises a :class:`TypeError`."""
+
+    steps: Tensor
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> NoReturn:
         name = type(self).__name__
@@ -40,12 +43,6 @@ class Augmentation(Transform):
             if plain(table):
                 setattr(self, name, table)
         return table
-
-
-class PlanAugmentation(Augmentation):
-    """A base class of augmentations that depend on a row's active plan steps, whose attention is above 0.01."""
-
-    steps: Tensor
 
     def _read_plans(self, plans: AnyPlans) -> Plans:
         plans = as_plans(plans)

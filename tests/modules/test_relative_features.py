@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_actors import CANONICAL, make_role_actor
+from small_actors import CANONICAL, make_role_actor, make_rows
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -80,12 +80,7 @@ def test_focus_mixes_steps_by_attention(seed):
 @pytest.mark.parametrize("kind", [FocusFeatures, RoleFeatures])
 def test_any_leading_shape_and_noise_in_training_mode(kind):
     features = kind(CANONICAL, noise=0.1).eval()
-    rows = TensorDict(
-        observation=torch.randn(2, 3, 39),
-        skill_weights=torch.rand(2, 3, CANONICAL.num_steps),
-        task_id=torch.full((2, 3), lw.task_id("push")),
-        batch_size=[2, 3],
-    )
+    rows = make_rows(2, 3, plans=CANONICAL).set("skill_weights", torch.rand(2, 3, CANONICAL.num_steps))
     once = features(rows.copy())["features"]
     assert once.shape == (2, 3, features.width)
     torch.testing.assert_close(features(rows.reshape(6))["features"].reshape(2, 3, -1), once)
@@ -109,10 +104,7 @@ def in_step(plans, task, step, number=5, seed=0):
 
 def written(roles, seen, **more):
     """Return the features (B, 12) of inputs from :func:`in_step`."""
-    observation, weights, rows = seen
-    ids = torch.tensor([lw.task_id(task) for task in roles.tables.index.tasks])[rows]
-    rows = TensorDict(observation=observation, skill_weights=weights, task_id=ids, batch_size=[len(ids)])
-    return roles(rows.update(more))["features"]
+    return roles(rows_of(roles.plans, seen).set("skill_weights", seen[1]).update(more))["features"]
 
 
 def rows_of(plans, seen):

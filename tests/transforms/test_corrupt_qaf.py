@@ -189,10 +189,9 @@ def test_resumed_environment_continues_with_the_same_errors():
         env.step(state.set("action", torch.zeros(2, 4)))
 
 
-@pytest.mark.parametrize("kind", ["scripted", "pcbc"])
-def test_evaluation_does_not_depend_on_num_envs_or_other_tasks(kind):
+def test_evaluation_does_not_depend_on_num_envs_or_other_tasks():
     plans = lw.load_plans("MT10")
-    actor = lw.ScriptedSkillActor(plans) if kind == "scripted" else lw.PlanConditionedActor(plans)
+    actor = lw.PlanConditionedActor(plans)
     corrupted = lw.transforms.CorruptQAF(plans, flip=0.2, delay=1)
 
     def answers(**options) -> dict[tuple[str, int], Tensor]:

@@ -48,14 +48,6 @@ def test_positions_and_action_turn_by_the_same_angle_and_keep_their_length(scale
     torch.testing.assert_close(now["action"].norm(dim=-1), was["action"].norm(dim=-1))
 
 
-def test_angles_are_normal_with_the_given_scale():
-    was = rows(20_000, reach=0.5)
-    torch.manual_seed(0)
-    turned = between(was["action"], lw.RandomYaw(0.3)(was.clone())["action"])
-    assert abs(turned.mean()) < 0.01
-    assert 0.29 < turned.std() < 0.31
-
-
 def test_action_outside_the_box_keeps_its_length():
     """Unclipped actions of the scripts, up to 25, are labels that must not be shortened."""
     was = rows(1_000, reach=20.0)
