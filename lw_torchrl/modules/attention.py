@@ -9,41 +9,20 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._util.checks import typed
-from lw_torchrl._util.devices import check_values
-from lw_torchrl._util.keys import Keys, dispatched, key_beside, read, write
-from lw_torchrl.language.task_index import PlanTables, answers_of, as_plans, pick
+from lw_torchrl._util.keys import Keys, dispatched, write
+from lw_torchrl.language.task_index import PlanTables, as_plans, pick
 from lw_torchrl.modules.parts import Part, in_mode_of
+from lw_torchrl.transforms.qaf import read_truth
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import AnyPlans
 
 TRUE_LOGIT = 5.0  # logit of a true condition; a false condition has -5 (paper, section "Plan Conditioning")
-# A plan step with more attention is active. If any condition is true, a step with a false condition gets about 1e-4.
-ACTIVE_WEIGHT = 0.01
 
 
 def attend(logits: Tensor, mask: Tensor) -> Tensor:
     """Return the softmax of ``logits`` (..., S) over the steps where ``mask`` (..., S) bool is true; 0 elsewhere."""
     return logits.masked_fill(~mask, -torch.inf).softmax(-1)
-
-
-def read_truth(tensordict: TensorDictBase, keys: Keys, tables: PlanTables) -> tuple[Tensor, Tensor]:
-    """Return truth values (..., S) and each task's row (...) in ``tables``; raise ValueError for other plans' truth."""
-    qaf, task_id = read(tensordict, keys)
-    return answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), tables)
-
-
-def check_truth(qaf: Tensor, shape: torch.Size) -> None:
-    """Raise a :class:`ValueError` unless ``qaf`` has this shape and is bool or holds numbers from 0 to 1."""
-    if qaf.shape != shape:
-        raise ValueError(
-            f"qaf must have shape {tuple(shape)}, one column for each step of the actor's plans, got "
-            f"{tuple(qaf.shape)}; give QAFTransform the same plans"
-        )
-    if qaf.dtype != torch.bool:
-        problem = "qaf must be bool, or numbers from 0 to 1 (soft truth), but holds NaN or other numbers"
-        check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)
 
 
 class PlanAttention(Part):
@@ -78,7 +57,6 @@ class PlanAttention(Part):
     _options = ("plans",)
     mask: Tensor
 
-    @typed
     def __init__(self, plans: AnyPlans, *, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:
         plans = as_plans(plans)
         tables = PlanTables(plans)
@@ -111,7 +89,6 @@ class PlanAttention(Part):
         # In the flattened mask (6T, S), row 6t + i marks the steps that turn i of task t allows.
         number = self.mask.shape[1]
         mask = pick(self.mask.flatten(0, 1), number * rows if turn is None else number * rows + turn % number)
-        check_truth(qaf, mask.shape)
         return attend(2 * TRUE_LOGIT * qaf.to(torch.float32) - TRUE_LOGIT, mask)
 
     @dispatched

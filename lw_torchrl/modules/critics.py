@@ -67,10 +67,9 @@ class Value(RenamedInputs):
         heads = [MLP(self._outputs, width=width, depth=depth, layer_norm=True) for _ in range(ensemble)]
         self.heads = nn.ModuleList(heads)
         if (size := encoding_width(trunk)) is not None:
+            size += self.layout.action_size * len(self._also_read)
             for head in heads:
-                materialize(
-                    head, torch.zeros(1, size + self.layout.action_size * len(self._also_read), dtype=torch.float32)
-                )
+                materialize(head, torch.zeros(1, size, dtype=torch.float32))
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

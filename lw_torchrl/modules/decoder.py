@@ -86,13 +86,7 @@ class GaussianDecoder(_ActionMLP):
 
     @typed
     def __init__(
-        self,
-        *,
-        width: Width = 256,
-        depth: Natural = 3,
-        actions: Count = 4,
-        squash: bool = False,
-        init_std: Scale = 0.3,
+        self, *, width: Width = 256, depth: Natural = 3, actions: Count = 4, squash: bool = False, init_std: Scale = 0.3
     ) -> None:
         if init_std <= LEAST_STD:
             raise ValueError(f"init_std must be above {LEAST_STD}, got {init_std}")

@@ -76,8 +76,7 @@ def _encode_module(module: nn.Module, plans: list[Plans], path: str) -> dict[str
         options = getattr(module, "config", None)
         if not isinstance(options, Mapping):
             raise TypeError(
-                f"{where} is a {kind.__qualname__}, which cannot be saved: add an attribute config, a dict of the "
-                "constructor's keyword arguments as JSON"
+                f"{where} is a {kind.__qualname__}, which cannot be saved: add config, the constructor's arguments"
             )
         if "plans" not in options and "plans" in signature(getattr(kind, "rebuild", kind)).parameters:
             options = {"plans": module.plans, **options}

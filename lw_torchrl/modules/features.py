@@ -52,8 +52,7 @@ class Features(TensorDictModuleBase):
     @property
     def observation_key(self) -> NestedKey:
         """The key of the observation."""
-        key: NestedKey = self.in_keys[0]
-        return key
+        return self.in_keys[0]
 
     def compute(self, tensordict: TensorDictBase) -> Tensor:
         """Return the features (B, F) without noise."""
@@ -124,19 +123,14 @@ class ObservationFeatures(Features):
         return {"kind": self.kind, "noise": self.noise, "layout": self.layout, **keys}
 
     def with_plans(self, plans: AnyPlans) -> ObservationFeatures:
-        """Return features with the same statistics for the layout of different plans.
-
-        Raises:
-            ValueError: the features have a different meaning in that layout.
-        """
+        """Return features with the same statistics for the layout of different plans; raise a :class:`ValueError` if
+        the features have a different meaning in that layout."""
         layout = as_plans(plans).layout
         if layout == self.layout:
             return self
         if self.kind not in TRANSFERS:
-            raise ValueError(
-                f"features {self.kind!r} of layout {self.layout.name!r} do not transfer to {layout.name!r}; use "
-                f"RoleFeatures and ObservationFeatures of kind {' or '.join(map(repr, TRANSFERS))}"
-            )
+            kinds = " or ".join(map(repr, TRANSFERS))
+            raise ValueError(f"features {self.kind!r} do not transfer to {layout.name!r}; use RoleFeatures or {kinds}")
         other = ObservationFeatures(**{**self.config, "layout": layout})
         other.mean, other.std = self.mean, self.std
         return in_mode_of(self, other)
@@ -242,11 +236,8 @@ def check_observation(observation: Tensor, layout: Layout) -> None:
 
 
 def relative(observation: Tensor, layout: Layout) -> Tensor:
-    """Return the differences between the positions of hand, objects and goal, in metres and squashed by tanh at two
-    scales, 2 cm and 10 cm.
-
-    For Meta-World (two objects), observations (..., 39) give (..., 54). Differences to an absent object are 0.
-    """
+    """Return the differences between the positions of hand, objects and goal, in metres and squashed by tanh at 2 cm
+    and 10 cm, for Meta-World (..., 54). Differences to an absent object are 0."""
     positions = [observation[..., place] for place in layout.positions]
     # An all-zero position marks an absent object; only objects after the first can be absent.
     absent = {n: (positions[n] == 0).all(-1, keepdim=True) for n in range(2, len(positions) - 1)}

@@ -83,12 +83,8 @@ class PointingNetwork(ClauseNetwork):
         return self.judge(first - second, clauses)
 
     def places(self, seen: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
-        """Locate objects, given by learned vectors (N, 32) float32, in pictures (B, H, W·C, 3) uint8.
-
-        Returns:
-            The objects' positions in metres and openings (B, N, 4) float32, and the attention over each picture
-            (B, C, N, h, w) float32.
-        """
+        """Return positions in metres and openings (B, N, 4) float32 of objects with learned vectors (N, 32) float32 in
+        pictures (B, H, W·C, 3) uint8, and the attention over each picture (B, C, N, h, w) float32."""
         rows = len(seen)
         pictures = seen.unflatten(-2, (self.cameras, -1)).permute(0, 2, 4, 1, 3).flatten(0, 1)
         features = self.encoder(pictures.to(torch.float32) / 255.0)
@@ -168,15 +164,8 @@ class ImageQueryEvaluator(ClauseEvaluator):
         image_encoder = IMAGE_ENCODERS[encoder]()
         with torch.no_grad():
             _, features, _, _ = image_encoder(torch.zeros(1, 3, height, width, dtype=torch.float32)).shape
-        self.network = PointingNetwork(
-            image_encoder,
-            features,
-            cameras=len(self.cameras),
-            names=len(self.names),
-            width=hidden,
-            depth=depth,
-            predicates=len(self.predicates),
-        )
+        sizes = {"cameras": len(self.cameras), "names": len(self.names), "predicates": len(self.predicates)}
+        self.network = PointingNetwork(image_encoder, features, width=hidden, depth=depth, **sizes)
         self.config |= dict(cameras=list(self.cameras), height=height, width=width, every=every, encoder=encoder)
         self.config |= dict(hidden=hidden, depth=depth, names=list(self.names))
 

@@ -113,21 +113,16 @@ class SkillMixer(Part):
 
     def latents(self) -> Tensor:
         """Return the latents (K, D) of the distinct skills."""
-        latents: Tensor = self.encoder(self.vectors)
-        return latents
-
-    def per_skill(self, weights: Tensor, task_id: Tensor, latents: Tensor) -> Tensor:
-        """Return the attention over the K distinct skills (..., K), given the attention over plan steps (..., S)."""
-        zeros = weights.new_zeros((*weights.shape[:-1], len(latents)))
-        rows = self.tables.rows(one_per_row(task_id, weights))
-        return zeros.scatter_add(-1, pick(self.index, rows), weights).to(latents.dtype)
+        return self.encoder(self.vectors)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         weights, task_id = read(tensordict, self.in_keys)
-        latents = self.latents()
+        latents, rows = self.latents(), self.tables.rows(one_per_row(task_id, weights))
         # One matrix product over the K skills is faster than gathering a latent for each step (B, S, D).
-        return write(tensordict, self, [self.per_skill(weights, task_id, latents) @ latents])
+        zeros = weights.new_zeros((*weights.shape[:-1], len(latents)))
+        per_skill = zeros.scatter_add(-1, pick(self.index, rows), weights).to(latents.dtype)
+        return write(tensordict, self, [per_skill @ latents])
 
 
 def _vectors_of_roles(plans: Plans, tables: PlanTables) -> tuple[Tensor, Tensor]:

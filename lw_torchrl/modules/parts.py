@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite
 from torchrl.modules import MLP as TorchRLMLP
 
-from lw_torchrl._util.checks import Count
+from lw_torchrl._util.checks import Count, check_value
 from lw_torchrl._util.keys import Keys, any_arguments, as_keys, check_apart, last_name
 
 if TYPE_CHECKING:
@@ -29,10 +29,7 @@ Width = Count | Sequence[Count]
 
 
 class MLP(TorchRLMLP):
-    """TorchRL's MLP with ReLU, which infers its input width from the first input and concatenates several inputs.
-
-    A sequence of widths sets the hidden layers and overrides ``depth``.
-    """
+    """TorchRL's MLP with ReLU, which concatenates its inputs; a sequence of widths overrides ``depth``."""
 
     def __init__(self, out_features: int, *, width: Width = 256, depth: int = 3, layer_norm: bool = False) -> None:
         widths = list(width) if isinstance(width, Sequence) else [width] * depth
@@ -56,10 +53,7 @@ def materialize(module: nn.Module, *inputs: Tensor) -> None:
 
 @torch.no_grad()
 def probe(module: nn.Module, example: Tensor) -> Any:
-    """Return a module's output for an example, which is moved to the module's device.
-
-    The global random state is left unchanged.
-    """
+    """Return a module's output for an example on the module's device, without changing the global random state."""
     weight = next(module.parameters(), None)
     with evaluating(module), torch.random.fork_rng(devices=[]):
         return module(example if weight is None else example.to(weight.device))
@@ -106,11 +100,8 @@ class Part(TensorDictModuleBase):
 
 
 class RenamedInputs(TensorDictModuleBase):
-    """A base class of modules with assignable ``in_keys``.
-
-    Assigning keys also renames the keys that the submodules read. Other modules that share these submodules keep their
-    own keys.
-    """
+    """A base class of modules with assignable ``in_keys``: new keys also rename the keys that the submodules read, but
+    not the keys of other modules that share these submodules."""
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -123,8 +114,7 @@ class RenamedInputs(TensorDictModuleBase):
         if before is not None:  # false in the constructor, where the parts already read these keys
             keys = as_keys("in_keys", keys, list(map(str, before)))
             check_apart(keys, self.out_keys_source)
-            renamed = dict(zip(before, keys, strict=True))
-            _rename_parts(self, renamed, {})
+            _rename_parts(self, dict(zip(before, keys, strict=True)), {})
         self._in_keys = list(keys)
 
 
@@ -147,10 +137,8 @@ def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[A
 def _rename_parts(
     module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool = False
 ) -> None:
-    """Replace a module's parts with copies that read renamed keys.
-
-    If the parts run ``in_order``, a key that an earlier part writes is not renamed in the parts that follow it.
-    """
+    """Replace a module's parts with copies that read renamed keys; if the parts run ``in_order``, a key that an
+    earlier part writes is not renamed in later parts."""
     in_sequence, remaining, parts = isinstance(module, TensorDictSequential), renamed, {}
     for name, part in module._modules.items():
         parts[name] = _reading(part, remaining, copies, in_sequence)
@@ -187,19 +175,15 @@ class NamedParts(RenamedInputs, TensorDictSequential):
         if name not in parts:
             # A misspelt part name would create an attribute that nothing uses. Users' subclasses may add modules.
             if parts and isinstance(value, nn.Module) and type(self).__module__.startswith("lw_torchrl."):
-                available = f"{type(self).__name__} has the parts {', '.join(parts)}"
-                raise AttributeError(
-                    f"{available}, but no {name}; set a module of a part as in actor.mixer.encoder = ..."
-                )
+                raise AttributeError(f"{type(self).__name__} has no part {name}, only {', '.join(parts)}")
             super().__setattr__(name, value)
             return
-        if not isinstance(value, nn.Module):
-            raise TypeError(f"{name} must be a module, got {value!r:.80}")
-        part = self.as_part(name, value)
+        part = self.as_part(name, check_value(name, value, nn.Module))
         check_same_plans({**parts, name: part})
         parts[name] = part
         self.plans, self.tasks, self.layout = trunk_attributes(self)
-        self._update_keys()
+        self._in_keys, out_keys = self._compute_in_and_out_keys(list(self.module.values()))
+        self._out_keys = self._out_keys_apparent = self._complete_out_keys = out_keys
 
     @property
     def out_keys(self) -> list[NestedKey]:
@@ -209,15 +193,8 @@ class NamedParts(RenamedInputs, TensorDictSequential):
     @out_keys.setter
     def out_keys(self, keys: Keys) -> None:
         if list(keys) != self._complete_out_keys:
-            raise ValueError(
-                f"out_keys of a {type(self).__name__} cannot be assigned, got {list(keys)}; pass out_keys= to the "
-                "constructor, or use select_out_keys to write fewer keys"
-            )
+            raise ValueError(f"out_keys cannot be assigned; use select_out_keys, or the constructor; got {list(keys)}")
         self._out_keys = self._out_keys_apparent = list(keys)
-
-    def _update_keys(self) -> None:
-        self._in_keys, out_keys = self._compute_in_and_out_keys(list(self.module.values()))
-        self._out_keys = self._out_keys_apparent = self._complete_out_keys = out_keys
 
 
 def action_spec(key: NestedKey, layout: Layout) -> Composite:
@@ -244,11 +221,8 @@ def _plans_inside(part: nn.Module) -> Any:
 
 
 def follow(part: Any, plans: AnyPlans) -> Any:
-    """Return a part that follows ``plans`` with the networks of ``part``; return a part without plans unchanged.
-
-    Raises:
-        TypeError: the part follows plans but has no method ``with_plans``.
-    """
+    """Return a part that follows ``plans`` with the networks of ``part``; return a part without plans unchanged. Raise
+    a :class:`TypeError` if the part follows plans but has no method ``with_plans``."""
     if hasattr(part, "with_plans"):
         return part.with_plans(plans)
     if isinstance(part, nn.Module) and _plans_inside(part) is None:
@@ -268,9 +242,7 @@ def _named_parts(trunk: TensorDictSequential) -> list[Any]:
 
 
 def trunk_attributes(trunk: TensorDictSequential) -> tuple[Any, Any, Layout]:
-    """Find the first part of a trunk that has a layout, and return its ``(plans, tasks, layout)``; ``plans`` and
-    ``tasks`` are None if the part has none.
-    """
+    """Return ``(plans, tasks, layout)`` of a trunk's first part with a layout; None for plans or tasks it lacks."""
     part = next((part for part in _named_parts(trunk) if hasattr(part, "layout")), None)
     if part is None:
         raise ValueError("trunk must have a part with a layout: PlanAttention, SkillMixer, TaskLatent or features")

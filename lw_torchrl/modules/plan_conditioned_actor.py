@@ -19,7 +19,7 @@ from torchrl.data import Composite
 from torchrl.modules import IndependentNormal, TanhNormal
 
 from lw_torchrl._util.checks import typed
-from lw_torchrl._util.keys import Keys, any_arguments, key_beside
+from lw_torchrl._util.keys import Keys, key_beside
 from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.attention import PlanAttention
@@ -251,15 +251,9 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         self.plans, self.tasks, self.layout = trunk_attributes(trunk)
         self.distribution, self.action = distribution, action
 
-    @any_arguments
-    def forward(self, *args: Any, **kwargs: Any) -> Any:
-        return super().forward(*args, **kwargs)
-
     @classmethod
     def of(cls, actor: Any, distribution: DistributionName, init_std: float) -> StochasticActor:
-        """Make a stochastic copy of a deterministic actor; the mode of the copy is the actor's action.
-
-        The copy's features have no noise, because noise would change the likelihoods from call to call.
+        """Make a stochastic copy of an actor, whose mode is the actor's action, without noise in the features.
 
         Raises:
             TypeError: the actor's decoder is not an :class:`MLPDecoder`.
@@ -267,11 +261,8 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         """
         old = getattr(actor.decoder, "network", None)
         if not isinstance(old, MLPDecoder):
-            raise TypeError(
-                f"stochastic() needs an actor with an MLPDecoder, got {type(old or actor.decoder).__name__}; otherwise "
-                "use a decoder that returns mean and standard deviation, with out_keys=['loc', 'scale'], and wrap "
-                "the actor in torchrl.modules.ProbabilisticActor"
-            )
+            kind = type(old or actor.decoder).__name__
+            raise TypeError(f"stochastic() needs an MLPDecoder, got {kind}; or use torchrl.modules.ProbabilisticActor")
         if distribution == "tanh_normal" and not old.squash:
             raise ValueError("distribution 'tanh_normal' squashes actions, but this actor does not; use 'normal'")
         options = {**old.config, "squash": distribution == "normal" and old.squash, "init_std": init_std}

@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._util.checks import check_choice, typed
+from lw_torchrl._util.checks import check_choice
 from lw_torchrl._util.registry import Registry, is_function
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
@@ -44,7 +44,6 @@ def one_hot_actor(plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
     return descriptor_actor(plans, condition="one-hot", **options)
 
 
-@typed
 def make_policy(method: str, plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
     """Make an untrained policy by the name of its method, for the tasks of ``plans``.
 
@@ -73,8 +72,7 @@ def _first(actor: Any, name: str) -> Any:
 
 def plans_of(actor: Any) -> Plans | None:
     """Return the plans that an actor, or one of its parts, follows; None if there are no plans."""
-    plans: Plans | None = _first(actor, "plans")
-    return plans
+    return _first(actor, "plans")
 
 
 def tasks_of(actor: Any) -> tuple[str, ...] | None:
@@ -84,17 +82,13 @@ def tasks_of(actor: Any) -> tuple[str, ...] | None:
 
 
 def layout_of(actor: Any) -> Layout:
-    """Return the observation layout of an actor: the first one defined by the actor, its plans or its parts, otherwise
-    Meta-World's.
-    """
+    """Return the first observation layout that an actor, its plans or its parts define, otherwise Meta-World's."""
     own, plans = getattr(actor, "layout", None), plans_of(actor)
-    layout: Layout = own or (plans.layout if plans is not None else _first(actor, "layout")) or METAWORLD
-    return layout
+    return own or (plans.layout if plans is not None else _first(actor, "layout")) or METAWORLD
 
 
 def draws(actor: Any) -> bool:
-    """Return whether an actor draws random numbers even without exploration, so that its actions depend on earlier
-    calls."""
+    """Return whether an actor draws random numbers without exploration, so that actions depend on earlier calls."""
     return any(getattr(part, "draws", False) for part in _parts(actor))
 
 

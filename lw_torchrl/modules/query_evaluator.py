@@ -107,11 +107,9 @@ class QueryEvaluator(TensorDictModuleBase):
     def logits_of(self, tensordict: TensorDictBase) -> Tensor:
         """Compute :meth:`logits` for a tensordict and convert them to float32; raise unless they are floats (B, S)."""
         logits = self.logits(*read(tensordict, self.in_keys))
-        name = f"logits of {type(self).__name__}"
-        if not logits.is_floating_point():
-            raise TypeError(f"{name} must be float32 logits (positive where a condition holds), got {logits.dtype}")
-        if logits.shape[-1:] != (self.plans.num_steps,):
-            raise ValueError(f"{name} must be (B, {self.plans.num_steps}), got shape {tuple(logits.shape)}")
+        if not logits.is_floating_point() or logits.shape[-1:] != (self.plans.num_steps,):
+            name, got = type(self).__name__, f"{logits.dtype} of shape {tuple(logits.shape)}"
+            raise ValueError(f"logits of {name} must be float32 (B, {self.plans.num_steps}), got {got}")
         return logits.to(torch.float32)
 
     @dispatched
@@ -221,8 +219,8 @@ class ClauseEvaluator(QueryEvaluator):
         self.tables: TaskTables[Clauses] = TaskTables(index, tables, f"tasks without a plan in {plans!r}")
 
     def check_seen(self, seen: Tensor) -> None:
-        """Raise a :class:`ValueError` unless the view has the shape and dtype that the network expects."""
-        raise NotImplementedError(f"{type(self).__name__} must override check_seen")
+        """Raise a :class:`ValueError` unless the view has the shape and dtype of the network's inputs."""
+        check_observation(seen, self.plans.layout)
 
     def logits(self, *read: Tensor) -> Tensor:
         """Return the logits (..., S) float32 for views (..., *view shape) and task ids (...) int64."""
@@ -241,7 +239,6 @@ class ClauseEvaluator(QueryEvaluator):
 
     def code(self, clauses: Sequence[tuple[Task, Clause]]) -> Clauses:
         """Encode clauses (G,) of any tasks as tensors. Without ``names``, every object has index 0."""
-        predicate_index = {name: number for number, name in enumerate(self.predicates)}
         name_index = {name: number for number, name in enumerate(self.names)}
         for task, clause in clauses:
             where = f"of {str(clause)!r}, in {task.name}"
@@ -253,7 +250,7 @@ class ClauseEvaluator(QueryEvaluator):
             first=torch.tensor(first),
             second=torch.tensor(second),
             shift=torch.tensor(shift, dtype=torch.float32),
-            predicate=torch.tensor([predicate_index[clause.predicate] for _, clause in clauses]),
+            predicate=torch.tensor([self.predicates.index(clause.predicate) for _, clause in clauses]),
             negated=torch.tensor([clause.negated for _, clause in clauses]),
             subject=torch.tensor([name_index.get(clause.subject, 0) for _, clause in clauses]),
             object=torch.tensor([name_index.get(clause.object or "", len(self.names)) for _, clause in clauses]),
@@ -266,10 +263,8 @@ class ClauseEvaluator(QueryEvaluator):
         by_plan = [list(dict.fromkeys(c for step in plan.steps for c in step.condition.clauses)) for plan in plans]
         most, start = max(map(len, by_plan)), 0
         if latched := [plan.task for plan in plans if any(step.condition.has_latch for step in plan.steps)]:
-            raise ValueError(
-                "a learned evaluator answers conditions on one observation, but plans of "
-                f"{', '.join(latched)} depend on earlier steps ('has been', 'once (...)'); use QAFTransform"
-            )
+            tasks = ", ".join(latched)
+            raise ValueError(f"a learned evaluator cannot be used: plans of {tasks} depend on earlier steps")
         if not most:
             raise ValueError("plans must have a condition with a clause, got only 'always' and 'never'")
         number = torch.zeros(len(tasks), most, dtype=torch.int64)
@@ -322,11 +317,8 @@ def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
 
 
 class ClauseNetwork(nn.Module):
-    """A network that maps clauses to logits.
-
-    A trunk encodes the difference of two positions. The logit is the dot product of the trunk's output and a learned
-    vector of the predicate, plus a bias. "not" flips the sign of the logit.
-    """
+    """A network that maps clauses to logits: the dot product of an MLP of the difference of two positions and a
+    learned vector of the predicate, plus a bias. "not" flips the sign."""
 
     numbers: int = 3  # components of a difference
 
@@ -393,6 +385,3 @@ class StateQueryEvaluator(ClauseEvaluator):
         super().__init__(plans, answers=answers, predicates=predicates)
         self.network = ClauseNetwork(width, depth, predicates=len(self.predicates))
         self.config |= {"width": width, "depth": depth}
-
-    def check_seen(self, seen: Tensor) -> None:
-        check_observation(seen, self.plans.layout)

@@ -10,7 +10,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._util.checks import Scale, typed
 from lw_torchrl._util.devices import check_finite
 from lw_torchrl._util.keys import Keys, as_keys, key_beside, read
 from lw_torchrl.language.layout import places
@@ -21,6 +20,7 @@ from lw_torchrl.language.task_index import PlanTables, one_per_row, pick
 from lw_torchrl.language.tasks import role_object
 from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.features import Features, check_observation, squash
+from lw_torchrl.transforms.augmentation import role_table
 from lw_torchrl.transforms.qaf import plan_program
 from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
 
@@ -127,9 +127,8 @@ def _compared(plan: ConditionalPlan) -> list[list[Pair]]:
 class FocusFeatures(_RelativePositions):
     """Relative positions of the objects that the conditions of the active plan steps compare.
 
-    A condition names the objects of its skill: "the gripper is above the handle and not near the handle". The same
-    features contain the handle's position relative to the gripper in one task and the puck's in another task, so the
-    policy can transfer its behavior between tasks.
+    The same features contain the handle's position relative to the gripper in one task and the puck's in another task,
+    so the policy can transfer its behavior between tasks.
 
     Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes
     ``features`` (B, 18). For each of two clauses, the first and the last with two objects, these are 9 numbers: the
@@ -147,9 +146,8 @@ class FocusFeatures(_RelativePositions):
         >>> actor = lw.PlanConditionedActor(plans, features=lw.modules.FocusFeatures(plans))
     """
 
-    @typed
     def __init__(
-        self, plans: AnyPlans, noise: Scale = 0.0, *, in_keys: Keys | None = None, out_keys: Keys | None = None
+        self, plans: AnyPlans, noise: float = 0.0, *, in_keys: Keys | None = None, out_keys: Keys | None = None
     ) -> None:
         super().__init__(plans, _compared, 2, noise, in_keys, out_keys)
 
@@ -158,13 +156,9 @@ class RoleFeatures(_RelativePositions):
     """Features of the active plan step: the target's position relative to the moved object, and the motion direction.
 
     "lower the gripper around the puck" and "... the mug" are the same motion in these features, so policies can
-    transfer it between tasks. The direction of "push the dial to the right" is to the right; that of "push it toward
-    the target location" is from the object to the goal. Offsets longer than 25 cm are shortened to 25 cm.
-
-    The point at which demonstrations touch an object, its *contact*, can differ from the observed position of the
-    object. :meth:`fit` computes the contacts from demonstrations, and the features use them as targets. In a task
-    without demonstrations, the target is the point that the plan names, and a carried object is first lifted to 15 cm
-    above the target, then lowered.
+    transfer it between tasks. Offsets longer than 25 cm are shortened to 25 cm. The targets are the points at which
+    demonstrations touch an object, its *contacts*, which :meth:`fit` computes. In a task without demonstrations, the
+    target is the point that the plan names, and a carried object is first lifted to 15 cm above the target.
 
     Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64, and the outputs
     of :class:`RandomYaw` and :class:`JitterTarget` if present; writes ``features`` (B, 12). These are the relative
@@ -202,29 +196,23 @@ class RoleFeatures(_RelativePositions):
     lifts: Tensor
     direction: Tensor
 
-    @typed
     def __init__(
-        self, plans: AnyPlans, noise: Scale = 0.0, *, in_keys: Keys | None = None, out_keys: Keys | None = None
+        self, plans: AnyPlans, noise: float = 0.0, *, in_keys: Keys | None = None, out_keys: Keys | None = None
     ) -> None:
         plans = as_plans(plans)
-        if not plans.has_roles:
-            raise ValueError("plans must have roles for RoleFeatures; use lw.canonical_plans(plans)")
         super().__init__(plans, _moved_to_target, 1, noise, in_keys, out_keys)
         self.width += 3
         shape = len(plans), plans.num_steps
-        at_contact, acts, lifts = (torch.zeros(shape, dtype=torch.bool) for _ in range(3))
+        at_contact, acts = (torch.zeros(shape, dtype=torch.bool) for _ in range(2))
+        lifts = role_table(plans, self.tables, lambda role: role.verb == "carry")
         direction = torch.zeros(*shape, 3, dtype=torch.float32)
         for task, plan in plans.items():
             for number, role in enumerate(_roles(plan)):
                 at = (self.tables.index.row(task), number)
-                by_hand, way = (
-                    role.moved == GRIPPER,
-                    torch.tensor(VECTORS.get(role.direction or "", (0.0,) * 3), dtype=torch.float32),
-                )
-                at_contact[at] = by_hand and _is_first(plan, role.target)
+                way = torch.tensor(VECTORS.get(role.direction or "", (0.0,) * 3), dtype=torch.float32)
+                at_contact[at] = role.moved == GRIPPER and _is_first(plan, role.target)
                 touches = role.verb in ("close", "pull") or (role.verb == "push" and role.manner == "push")
                 acts[at] = _is_first(plan, role.moved) or (at_contact[at] and touches)
-                lifts[at] = role.verb == "carry"
                 if role.verb == "move":  # the target is next to the object's current position
                     self.offset[at] += _AWAY * way
                 else:
@@ -255,9 +243,7 @@ class RoleFeatures(_RelativePositions):
         return other
 
     def share(self) -> None:
-        """Copy the contact points to all modules created by :meth:`with_plans`; call this method after changing the
-        buffers.
-        """
+        """Copy the contact points to all modules created by :meth:`with_plans`; call it after changing the buffers."""
         for other in self._sharing:
             if other is not self:
                 other._copy(self)

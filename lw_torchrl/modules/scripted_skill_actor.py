@@ -17,8 +17,8 @@ from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.modules.attention import check_truth, read_truth
 from lw_torchrl.modules.parts import Part, in_mode_of
+from lw_torchrl.transforms.qaf import read_truth
 
 
 class ScriptedSkillActor(Part):
@@ -90,8 +90,7 @@ class ScriptedSkillActor(Part):
     @property
     def observation_key(self) -> NestedKey:
         """The key of the observation."""
-        key: NestedKey = self.in_keys[0]
-        return key
+        return self.in_keys[0]
 
     def with_plans(self, plans: AnyPlans) -> ScriptedSkillActor:
         """Return an actor that has the same skills but follows other plans."""
@@ -101,25 +100,20 @@ class ScriptedSkillActor(Part):
     def skill_weights(self, tensordict: TensorDictBase) -> Tensor:
         """Return the weight of each plan step, (B, S) float32."""
         qaf, rows = read_truth(tensordict, self.truth_keys, self.tables)
-        check_truth(qaf, torch.Size((*rows.shape, self.tables.mask.shape[-1])))
         qaf, steps = qaf > 0.5, qaf.shape[-1]
         last = one_hot(self._last.to(rows.device)[rows], steps).bool()
         active = torch.where(qaf.any(-1, keepdim=True), qaf, last).float()
         if self.select == "mix":
             return active / active.sum(-1, keepdim=True)
         # Noise in [0, 1) orders the active steps at random, and never ranks an inactive step above an active step.
-        noise = (
-            torch.rand(active.shape, generator=self._generator, dtype=torch.float32).to(active.device)
-            if self.draws
-            else 0.0
-        )
-        return one_hot((noise + active).argmax(-1), steps).float()
+        if self.draws:
+            active += torch.rand(active.shape, generator=self._generator, dtype=torch.float32).to(active.device)
+        return one_hot(active.argmax(-1), steps).float()
 
     def skill_actions(self, tensordict: TensorDictBase) -> Tensor:
         """Return the action of each plan step's skill, (B, S, A) float32."""
         observation, task_id, _ = read(tensordict, self.in_keys)
-        actions: Tensor = self.program(observation, task_id)
-        return actions
+        return self.program(observation, task_id)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -60,8 +60,7 @@ class _ActionWrapper(_Wrapper):
 class ActorEnsemble(_Wrapper):
     """An ensemble that averages the actions of actors trained separately on the same demonstrations.
 
-    In states unlike the demonstrations, the members make different errors, which partly cancel in the mean, especially
-    if the members have different features or augmentations.
+    The members' errors partly cancel in the mean, especially if the members have different features or augmentations.
 
     Reads the input keys of the members; writes ``action`` (B, A) float32, and the mean ``skill_weights`` (B, S) float32
     if the members write them.
@@ -86,15 +85,12 @@ class ActorEnsemble(_Wrapper):
     @typed
     def __init__(self, members: Sequence[TensorDictModuleBase]) -> None:
         super().__init__()
-        if not members:
-            raise ValueError("members must be at least one actor, got none")
-        first = members[0]
-        if any(_fingerprint(member) != _fingerprint(first) for member in members):
-            raise ValueError("members must have the same plans")
-        if any(tasks_of(member) != tasks_of(first) for member in members):
-            raise ValueError("members must have the same tasks")
+        if len({(_fingerprint(member), tasks_of(member)) for member in members}) != 1:
+            raise ValueError(
+                f"members must be one or more actors with equal plans and tasks, got {len(members)} actors"
+            )
         self.members: Any = nn.ModuleList(members)
-        written = [key for key in first.out_keys if last_name(key) in ("action", "skill_weights")]
+        written = [key for key in members[0].out_keys if last_name(key) in ("action", "skill_weights")]
         self._written: list[NestedKey] = sorted(written, key=last_name)
         self._wrap(members, self._written)
 
@@ -110,9 +106,7 @@ class ActorEnsemble(_Wrapper):
 
 
 class DecidedGripper(_ActionWrapper):
-    """A wrapper that opens or closes the gripper fully, except during training.
-
-    Half-open fingers knock objects over, and half-closed fingers drop objects.
+    """A wrapper that opens or closes the gripper fully, except during training; half-closed fingers drop objects.
 
     Reads and writes the actor's keys; the gripper effort in ``action`` (B, A) is -1 or 1.
 
@@ -159,8 +153,6 @@ def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -
 
 class DemonstratedActor(_Wrapper):
     """A policy that uses an actor without plans for demonstrated tasks, and an actor with plans for all other tasks.
-
-    Demonstrated tasks need no plan: with ten demonstrations, a plan does not increase the success rate.
 
     Reads the input keys of both actors; writes ``action`` (B, A) float32 and the other keys that ``others`` writes.
 

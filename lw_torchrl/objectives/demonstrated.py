@@ -39,8 +39,6 @@ class _ImitatesDemonstrations(_Loss):
         reduction: Reduction | None = None,
         **options: Any,
     ) -> None:
-        if "alpha" in self._fixed and "alpha" in options:
-            raise ValueError("alpha is fixed to 1; use bc_weight to weight the imitation loss")
         spec = options.get("action_spec")
         if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:
             got = f"shape {tuple(spec.shape)}; use env.action_spec_unbatched"
@@ -55,11 +53,8 @@ class _ImitatesDemonstrations(_Loss):
         self._in_keys.append(self.tensor_keys.is_demonstration)
 
     def _imitation(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        """Return the squared distance (B,) float32 between actions (B, A) and the demonstrated actions.
-
-        The distance is 0 in rows without a demonstration. The others are scaled so that the mean over all rows is the
-        mean over the demonstrations.
-        """
+        """Return the squared distance (B,) float32 of actions (B, A) to the demonstrated ones, 0 in other rows, scaled
+        so that the mean over all rows is the mean over the demonstrations."""
         key = self.tensor_keys.is_demonstration
         (is_demonstration,) = read(tensordict, [key])
         if is_demonstration.dtype != torch.bool:
@@ -155,8 +150,7 @@ class DemonstratedSACLoss(_ImitatesDemonstrations, SACLoss):
         >>> loss = lw.objectives.DemonstratedSACLoss(actor, lw.PlanConditionedQValue(plans), bc_weight=2.0)
         >>> loss.make_value_estimator(gamma=0.99)
 
-    Source: Haarnoja et al., 'Soft Actor-Critic Algorithms and Applications', with the
-    imitation loss of :class:`DemonstratedTD3Loss`.
+    Source: Haarnoja et al., 'Soft Actor-Critic Algorithms and Applications', with an imitation loss.
     """
 
     @dataclass

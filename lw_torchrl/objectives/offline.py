@@ -112,7 +112,7 @@ class ExpectileValueLoss(LossModule):
         """Set the estimator of the targets, and return this loss.
 
         Args:
-            value_type: an estimator, an estimator class, or ``ValueEstimators.TD0``; None for TD0. The other members of
+            value_type: an estimator, an estimator class, or ``ValueEstimators.TD0``; None for TD0. Other members of
                 ``ValueEstimators`` need rows in time order, and raise a :class:`NotImplementedError`.
             **hyperparams: ``gamma``, the discount per time step, by default 0.99.
         """
@@ -165,9 +165,7 @@ class ExpectileValueLoss(LossModule):
         is_ensemble = len(getattr(network, "heads", ())) > 1
         if unravel_key(key) not in network.out_keys or (is_ensemble and key != keys.values):
             needed = keys.values if is_ensemble else keys.value
-            raise ValueError(
-                f"value_network must write {needed!r}, but writes {network.out_keys}; use loss.set_keys(...)"
-            )
+            raise ValueError(f"value_network must write {needed!r}, got {network.out_keys}; use loss.set_keys(...)")
         with params.to_module(network, preserve_module_state=False):
             # Pass all keys, because networks also read optional keys: RandomYaw's angle, qaf_plan.
             (values,) = read(network(tensordict.copy()), [key])
@@ -277,9 +275,7 @@ class AdvantageWeightedLoss(LossModule):
 
 @typed
 def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
-    """Standardize advantages to mean 0 and standard deviation 1 over the rows of each task.
-
-    Without standardization, tasks with large rewards would get all the weight.
+    """Standardize advantages to mean 0 and standard deviation 1 over each task's rows, to weight tasks equally.
 
     Args:
         advantage: (R, 1) float32, finite.
@@ -296,10 +292,9 @@ def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
         >>> standardize_by_task(torch.tensor([[1.0], [3.0], [7.0]]), torch.tensor([4, 4, 9])).tolist()
         [[-1.0], [1.0], [0.0]]
     """
-    if advantage.dtype != torch.float32 or advantage.ndim != 2 or advantage.shape[1] != 1:
-        raise ValueError(f"advantage must be (R, 1) float32, got {tuple(advantage.shape)} {advantage.dtype}")
-    if task_id.dtype != torch.int64 or task_id.shape != advantage.shape[:1]:
-        raise ValueError(f"task_id must be ({len(advantage)},) int64, got {tuple(task_id.shape)} {task_id.dtype}")
+    given = [(tuple(tensor.shape), tensor.dtype) for tensor in (advantage, task_id)]
+    if given != [((*task_id.shape[:1], 1), torch.float32), (tuple(task_id.shape[:1]), torch.int64)]:
+        raise ValueError(f"advantage must be (R, 1) float32 and task_id (R,) int64, got {given}")
     check_finite("advantage", advantage)
     standardized = torch.zeros_like(advantage)
     for task in task_id.unique():

@@ -13,19 +13,23 @@ from torchrl.envs import Transform
 
 from lw_torchrl._util.checks import Probability, Scale, typed
 from lw_torchrl._util.devices import plain
-from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside, read
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, read
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.roles import StepRole
-from lw_torchrl.language.task_index import PlanTables, answers_of
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.tasks import role_object
+from lw_torchrl.transforms.qaf import read_truth
 
 # A plan step with more attention is active. If any condition is true, a step with a false condition gets about 1e-4.
-ACTIVE = 0.01
+ACTIVE_WEIGHT = 0.01
 
 
-class Augmentation(Transform):
-    """Base class for transforms that randomly change sampled rows. Using one in an environment raises a TypeError."""
+class PlanAugmentation(Transform):
+    """A base class of augmentations that depend on a row's active plan steps, whose attention is above 0.01. Using one
+    in an environment raises a :class:`TypeError`."""
+
+    steps: Tensor
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> NoReturn:
         name = type(self).__name__
@@ -40,15 +44,6 @@ class Augmentation(Transform):
                 setattr(self, name, table)
         return table
 
-
-class PlanAugmentation(Augmentation):
-    """A base class of augmentations that depend on which steps of a row's plan are active.
-
-    A plan step is active if its attention weight is above 0.01 (see :class:`~lw_torchrl.modules.PlanAttention`).
-    """
-
-    steps: Tensor
-
     def _read_plans(self, plans: AnyPlans) -> Plans:
         plans = as_plans(plans)
         self.fingerprint = plans.fingerprint  # identifies this transform in training checkpoints
@@ -59,29 +54,23 @@ class PlanAugmentation(Augmentation):
     def answers(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor, Tensor]:
         """Return ``qaf`` (B, S), row indices of the tables (B,) int64, and a mask (B, S) bool of the steps that are
         available in the current turn (see :class:`FallbackTurns`)."""
-        qaf, task_id = read(tensordict, keys)
-        qaf, rows = answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), self._tables)
-        if qaf.shape != (shape := (*rows.shape, self._tables.mask.shape[-1])):
-            raise ValueError(f"qaf must have shape {shape}, one column for each step of plans, got {tuple(qaf.shape)}")
+        qaf, rows = read_truth(tensordict, keys, self._tables)
         turn = tensordict.get("turn", None)
         steps = self.table("steps", rows.device)
         return qaf, rows, steps[rows, torch.zeros_like(rows) if turn is None else turn % steps.shape[1]]
 
     def active(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor]:
-        """Return a mask of the active plan steps (B, S) bool, and, for each batch row, the index of its row in the
-        query tables (B,) int64.
-        """
+        """Return a mask of the active plan steps (B, S) bool, and the row of each task in the tables (B,) int64."""
         qaf, rows, steps = self.answers(tensordict, keys)
         weights = (10.0 * qaf.to(torch.float32) - 5.0).masked_fill(~steps, -torch.inf).softmax(-1)
-        return weights > ACTIVE, rows
+        return weights > ACTIVE_WEIGHT, rows
 
 
 class SwapUnmentioned(PlanAugmentation):
     """An augmentation that gives each object not mentioned by an active plan step its position in a random row.
 
-    This keeps a policy from relying on these objects. A plan step mentions an object, or the goal, if the step's
-    condition or skill names it. Use this transform in a replay buffer, after a :class:`QAFTransform`, which must see
-    the unchanged scene.
+    A plan step mentions an object, or the goal, if its condition or skill names it. For replay buffers, after a
+    :class:`QAFTransform`, which must see the unchanged scene.
 
     Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); changes ``observation`` (B, D) and ``("next", "observation")`` in
     the same way. An object keeps its position if a step that is active in either observation mentions it. Draws from
@@ -163,8 +152,7 @@ class JitterTarget(PlanAugmentation):
     The offset models uncertain contact points: :class:`~lw_torchrl.modules.RoleFeatures` adds it to the target's
     position. For replay buffers, after a :class:`QAFTransform`. Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); writes
     ``target_offset`` (B, 3) float32, metres: normal noise of ``std`` in z and ``std / 2`` in x and y, or 0 without such
-    a step. Draws from PyTorch's global generator. TorchRL's losses, except BCLoss, do not pass the offset on to the
-    features, so :class:`~lw_torchrl.OfflineTrainer` rejects these losses.
+    a step. Draws from PyTorch's global generator. Of TorchRL's losses, only BCLoss passes the offset to the features.
 
     Args:
         plans: canonical plans, see :func:`~lw_torchrl.canonical_plans`, whose conditions ``qaf`` answers.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import torch
 from tensordict import unravel_key
@@ -12,6 +12,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
+
+State = TypeVar("State")
 
 
 def base_env(transform: Transform) -> EnvBase | None:
@@ -83,9 +85,7 @@ class KeepsEnvState(EpisodeTransform):
     """A base class of transforms that save the environment's state in their own ``state_dict``.
 
     TorchRL does not save this state, so a resumed Collector would run the same episodes again. After
-    ``load_state_dict``, reset the environment (``collector.reset()``). Around a ParallelEnv, such a transform does not
-    call ``ParallelEnv.load_state_dict``, which desynchronizes the workers in TorchRL 0.14.1 unless
-    ``use_buffers=False``.
+    ``load_state_dict``, reset the environment (``collector.reset()``).
     """
 
     def get_extra_state(self) -> Tensor:
@@ -113,12 +113,17 @@ class KeepsEnvState(EpisodeTransform):
             flags[:] = [0] * len(flags)
 
 
-def reset_rows(before: Tensor | None, now: Tensor, begun: Tensor | None, more: int = 0) -> Tensor:
-    """Return ``now`` (B, ...) in rows where ``begun`` (B bool, or None for all rows) is true, and ``before`` elsewhere.
+def begun(state: State | None) -> State:
+    """Return a transform's ``state`` of the episodes; raise a :class:`RuntimeError` if a reset has not yet set it."""
+    if state is None:
+        raise RuntimeError("no episode has begun: reset the environment before the first step")
+    return state
 
-    The tensors have ``more`` dimensions in addition to the batch dimensions B.
-    """
-    if before is None or begun is None or before.shape != now.shape:
+
+def reset_rows(before: Tensor | None, now: Tensor, which: Tensor | None, more: int = 0) -> Tensor:
+    """Return ``now`` (B, ...) in rows where ``which`` (B bool, or None for all rows) is true, and ``before`` elsewhere.
+    The tensors have ``more`` dimensions in addition to the batch dimensions B."""
+    if before is None or which is None or before.shape != now.shape:
         return now
     shape = (*now.shape[: now.dim() - more], *[1] * more)
-    return torch.where(begun.reshape(shape), now, before)
+    return torch.where(which.reshape(shape), now, before)

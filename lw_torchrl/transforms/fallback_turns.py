@@ -5,13 +5,13 @@ from typing import NamedTuple
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
 from lw_torchrl._util.checks import Count, Scale, typed
 from lw_torchrl._util.keys import Keys, as_keys, check_apart, read
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.transforms.environment import reset_rows
+from lw_torchrl.transforms.environment import begun, reset_rows
 
 
 class _Rows(NamedTuple):
@@ -93,9 +93,7 @@ class FallbackTurns(Transform):
         return self._keep(tensordict_reset, _Rows(zeros, zeros, zeros, now), tensordict.get("_reset", None))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if self._rows is None:
-            raise RuntimeError("no episode has begun: reset the environment before the first step")
-        now, (turn, waited, lasted, stood) = self._positions(next_tensordict), self._rows
+        now, (turn, waited, lasted, stood) = self._positions(next_tensordict), begun(self._rows)
         moved = ((now - stood).norm(dim=-1) > self.still).any(-1)
         waited, lasted = torch.where(moved, 0, waited + 1), lasted + 1
         over = torch.where(turn % 3 == 1, lasted >= self.release, (waited >= self.patience) | (lasted >= self.longest))
@@ -110,8 +108,7 @@ class FallbackTurns(Transform):
                 rows.set(self.out_keys[0], zeros)
         return tensordict
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        assert isinstance(observation_spec, Composite)
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         shape, device = observation_spec.shape, observation_spec.device
         observation_spec[self.out_keys[0]] = Unbounded(shape, dtype=torch.int64, device=device)
         return observation_spec

@@ -16,7 +16,7 @@ from lw_torchrl._util.checks import Count, typed
 from lw_torchrl._util.keys import Keys, as_keys, read
 from lw_torchrl._util.rendering import check_cameras
 from lw_torchrl.language.tasks import TASKS, Task, TaskList, named_tasks, task_id
-from lw_torchrl.transforms.environment import KeepsEnvState, base_env, reset_rows
+from lw_torchrl.transforms.environment import KeepsEnvState, base_env, begun, reset_rows
 
 
 class CameraTransform(KeepsEnvState):
@@ -76,9 +76,7 @@ class CameraTransform(KeepsEnvState):
             raise TypeError(f"CameraTransform needs a LanguageWorldEnv (in each worker), got {name}")
 
     def _draw(self, which: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
-        """Re-render the images of the rows selected by the boolean mask ``which`` (N,), then write the images of all N
-        rows.
-        """
+        """Render the images of the rows ``which`` (N,) bool, and write the images of all N rows."""
         env: Any = base_env(self)
         rows = which.nonzero().flatten()
         if self._taken is None:
@@ -91,30 +89,23 @@ class CameraTransform(KeepsEnvState):
         return tensordict.set(self.out_keys[0], self._taken.clone().reshape(*tensordict.batch_size, *self.shape))
 
     def _rows(self, mask: Tensor | None) -> Tensor:
-        env: Any = base_env(self)
-        count = len(env.row_tasks)
+        count = len(base_env(self).row_tasks)  # type: ignore[union-attr]
         return torch.ones(count, dtype=torch.bool) if mask is None else mask.reshape(count).cpu()
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        begun = self._rows(tensordict.get("_reset", None))
-        self._steps = reset_rows(self._steps, torch.zeros(len(begun), dtype=torch.int64), begun)
-        return self._draw(begun, tensordict_reset)
+        which = self._rows(tensordict.get("_reset", None))
+        self._steps = reset_rows(self._steps, torch.zeros(len(which), dtype=torch.int64), which)
+        return self._draw(which, tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if self._steps is None:
-            raise RuntimeError("no episode has begun: reset the environment before the first step")
         moved = self._rows(tensordict.get("_step", None))
-        self._steps = self._steps + moved
+        self._steps = begun(self._steps) + moved
         return self._draw(moved & (self._steps % self.every == 0), next_tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        raise ValueError(
-            "CameraTransform renders an environment; for a dataset use lw.data.add_pictures(root, ...), then "
-            "replay.add_column('pixels', lw.data.load_pictures(replay, ...))"
-        )
+        raise ValueError("CameraTransform renders an environment; for a dataset use add_pictures and load_pictures")
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        assert isinstance(observation_spec, Composite)
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         shape = (*observation_spec.shape, *self.shape)
         observation_spec[self.out_keys[0]] = UnboundedDiscrete(shape, dtype=torch.uint8, device=observation_spec.device)
         return observation_spec
@@ -145,7 +136,6 @@ class LanguageInstruction(Transform):
     Source: ``torchrl.envs.LiberoEnv``.
     """
 
-    @typed
     def __init__(
         self, tasks: TaskList | None = None, *, in_keys: Keys | None = None, out_keys: Keys | None = None
     ) -> None:
@@ -175,8 +165,7 @@ class LanguageInstruction(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict)
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        assert isinstance(observation_spec, Composite)
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         shape, device = observation_spec.shape, observation_spec.device
         example = next(iter(self._texts.values())).data
         observation_spec[self.out_keys[0]] = NonTensor(shape, example_data=example, device=device)
@@ -252,8 +241,7 @@ class SuiteTransform(Transform):
         assert self.act is not None
         return self.act(action)
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        assert isinstance(observation_spec, Composite)
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         shape, device = observation_spec.shape, observation_spec.device
         observation_spec["observation"] = Unbounded((*shape, self.layout.size), device=device, dtype=torch.float32)
         observation_spec["task_id"] = Unbounded(shape, device=device, dtype=torch.int64)

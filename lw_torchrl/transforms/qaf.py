@@ -7,20 +7,22 @@ from typing import NamedTuple
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite, TensorSpec, Unbounded
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from lw_torchrl._util.checks import Count, Natural, Probability, missing_keys, typed
+from lw_torchrl._util.checks import Count, Natural, Probability, typed
+from lw_torchrl._util.devices import check_values
 from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside, read
 from lw_torchrl._util.reproducibility import episode_hash
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.task_index import PlanTables, TaskTables, one_per_row
+from lw_torchrl.language.task_index import PlanTables, TaskTables, answers_of, one_per_row
 from lw_torchrl.transforms.environment import (
     EpisodeTransform,
     KeepsEnvState,
     base_env,
+    begun,
     refuse_changed,
     reset_rows,
 )
@@ -30,6 +32,19 @@ _HALF = (torch.float16, torch.bfloat16)  # too coarse for positions in metres: c
 
 class _Number(NamedTuple):
     plan: Tensor  # (T,) int64
+
+
+def read_truth(tensordict: TensorDictBase, keys: Keys, tables: PlanTables) -> tuple[Tensor, Tensor]:
+    """Return truth values (..., S), and each task's row (...) int64 in ``tables``, from the keys of ``qaf`` and
+    ``task_id``; raise a :class:`ValueError` for other plans' truth, another shape, or soft truth outside [0, 1]."""
+    qaf, task_id = read(tensordict, keys)
+    qaf, rows = answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), tables)
+    if qaf.shape != (shape := (*rows.shape, tables.mask.shape[-1])):
+        raise ValueError(f"qaf must have shape {shape}, got {tuple(qaf.shape)}; give QAFTransform the same plans")
+    if qaf.dtype != torch.bool:
+        problem = "qaf must be bool, or numbers from 0 to 1 (soft truth), but holds NaN or other numbers"
+        check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)
+    return qaf, rows
 
 
 def plan_program(plans: Plans) -> QueryProgram:
@@ -103,7 +118,6 @@ class QAFTransform(KeepsEnvState):
     Source: paper section 'Query Answering Function'.
     """
 
-    @typed
     def __init__(self, plans: AnyPlans, *, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:
         truth = as_keys("out_keys", out_keys, ("qaf",))
         keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
@@ -121,11 +135,9 @@ class QAFTransform(KeepsEnvState):
         """Return a transform that answers the conditions of different plans."""
         return QAFTransform(plans, in_keys=self.in_keys, out_keys=self.out_keys[:1])
 
-    def _write(self, tensordict: TensorDictBase, task_id: Tensor | None, before: Tensor | None = None) -> None:
+    def _write(self, tensordict: TensorDictBase, task_id: Tensor, before: Tensor | None = None) -> None:
         """Write the answers, and the latches after this step, given the latches ``before`` this step."""
-        observation = tensordict.get(self.in_keys[0], None)
-        if observation is None or task_id is None:
-            raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys))
+        (observation,) = read(tensordict, self.in_keys[:1])
         if observation.dtype in _HALF:
             got = f"got {observation.dtype}; put QAFTransform before the transform that casts the observation"
             raise ValueError(f"observation must be float32 or float64, {got}")
@@ -140,43 +152,29 @@ class QAFTransform(KeepsEnvState):
         tensordict.set(self.out_keys[1], number.reshape(task_id.shape).clone())  # collectors zero the tensor in place
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        before = None
-        if self.program.num_latches:
-            before = tensordict.get(self.out_keys[2], None)
-            if before is None:
-                raise ValueError(f"the input of a step lacks {self.out_keys[2]!r}, which a reset writes")
-        self._write(next_tensordict, next_tensordict.get(self.in_keys[1], None), before)
+        before = read(tensordict, self.out_keys[2:])[0] if self.program.num_latches else None  # a reset writes them
+        (task_id,) = read(next_tensordict, self.in_keys[1:])
+        self._write(next_tensordict, task_id, before)
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        begun, task = tensordict.get("_reset", None), tensordict_reset.get(self.in_keys[1], None)
-        self._task = task if task is None else reset_rows(self._task, task, begun)
-        self._write(tensordict_reset, self._task, self._cleared(tensordict, tensordict_reset, begun))
+        which, (observation, task), latches = tensordict.get("_reset", None), read(tensordict_reset, self.in_keys), None
+        self._task = reset_rows(self._task, task, which)
+        if count := self.program.num_latches:
+            # If ``tensordict`` lacks the latches, all become false, and TorchRL restores those of the other rows.
+            false = torch.zeros(*observation.shape[:-1], count, dtype=torch.bool, device=observation.device)
+            latches = reset_rows(tensordict.get(self.out_keys[2], None), false, which, 1)
+        self._write(tensordict_reset, self._task, latches)
         return tensordict_reset
-
-    def _cleared(self, tensordict: TensorDictBase, fresh: TensorDictBase, begun: Tensor | None) -> Tensor | None:
-        """Return the latches of all rows after a reset of the rows ``begun``, which sets their latches to false.
-
-        If ``tensordict`` lacks the latches, all become false, and TorchRL restores those of the other rows.
-        """
-        observation = fresh.get(self.in_keys[0], None)
-        if not self.program.num_latches or observation is None:
-            return None
-        shape = (*observation.shape[:-1], self.program.num_latches)
-        none = torch.zeros(shape, dtype=torch.bool, device=observation.device)
-        return reset_rows(tensordict.get(self.out_keys[2], None), none, begun, 1)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation, task = self.in_keys
-        task_id, before = tensordict.get(task, None), None
-        if self.program.num_latches:
-            before = tensordict.get(self.out_keys[2], None)
-            if before is None:
-                raise ValueError(
-                    f"the plans' conditions depend on earlier steps ('has been', 'once (...)'), but the rows have no "
-                    f"{self.out_keys[2]!r}; use rows of a rollout with this QAFTransform, or "
-                    "LanguageWorldExperienceReplay(transform=QAFTransform(plans))"
-                )
+        (_, task_id), before = read(tensordict, self.in_keys), None
+        if self.program.num_latches and (before := tensordict.get(self.out_keys[2], None)) is None:
+            raise ValueError(
+                f"rows have no {self.out_keys[2]!r}, but conditions depend on earlier steps; use rows of a rollout "
+                "with this QAFTransform, or LanguageWorldExperienceReplay(transform=QAFTransform(plans))"
+            )
         self._write(tensordict, task_id, before)
         following = tensordict.get("next", None)
         if following is not None and following.get(observation, None) is not None:
@@ -192,8 +190,7 @@ class QAFTransform(KeepsEnvState):
         if not isinstance(env, BatchedEnvBase):  # its workers may not be running yet
             self.plans.require(getattr(env, "tasks", ()))
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        assert isinstance(observation_spec, Composite)
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         refuse_changed(self, self.in_keys[0])  # a transform may have been inserted before this one
         steps, shape, device = self.program.num_queries, observation_spec.shape, observation_spec.device
         observation_spec[self.out_keys[0]] = Binary(steps, shape=(*shape, steps), dtype=torch.bool, device=device)
@@ -286,8 +283,8 @@ class CorruptQAF(EpisodeTransform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         truth, task, episode = read(tensordict_reset, self.in_keys)
-        begun = tensordict.get("_reset", None)
-        self._task, self._episode = reset_rows(self._task, task, begun), reset_rows(self._episode, episode, begun)
+        which = tensordict.get("_reset", None)
+        self._task, self._episode = reset_rows(self._task, task, which), reset_rows(self._episode, episode, which)
         self._plan = self._tables.rows(self._task)
         self._tables.refuse_others(tensordict_reset.get(key_beside(self.in_keys[0], "_plan"), None), self._plan)
         shape = (*self._plan.shape, self.plans.num_steps)
@@ -297,53 +294,38 @@ class CorruptQAF(EpisodeTransform):
         if self.flip:
             plans = [self.plans[self._tables.index.tasks[row]] for row in self._plan.flatten().cpu().tolist()]
             numbers = self._episode.flatten().clamp(min=0).cpu().tolist()  # -1: a row that was never reset
-            keys = [
-                episode_hash("answers/flip", plan.definition, self.seed, number)
-                for plan, number in zip(plans, numbers, strict=True)
-            ]
+            pairs = zip(plans, numbers, strict=True)
+            keys = [episode_hash("answers/flip", plan.definition, self.seed, number) for plan, number in pairs]
             self._key = torch.tensor(keys, device=self._plan.device).reshape(self._plan.shape)
             self._real = self._tables.mask.to(self._plan.device)[self._plan]
-        self._steps = reset_rows(self._steps, torch.zeros_like(self._plan), begun)
-        self._answers = reset_rows(self._answers, torch.stack([truth] * self._places, -2), begun, 2)
+        self._steps = reset_rows(self._steps, torch.zeros_like(self._plan), which)
+        self._answers = reset_rows(self._answers, torch.stack([truth] * self._places, -2), which, 2)
         return self._show(tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if self._steps is None or self._answers is None:
-            raise RuntimeError("no episode has begun since the start or load_state_dict: reset the environment")
-        moved = tensordict.get("_step", None)
-        moved = torch.ones_like(self._steps, dtype=torch.bool) if moved is None else moved.reshape(self._steps.shape)
-        self._steps = self._steps + moved
+        steps, moved = begun(self._steps), tensordict.get("_step", None)
+        moved = torch.ones_like(steps, dtype=torch.bool) if moved is None else moved.reshape(steps.shape)
+        self._steps = steps + moved
         due = moved & (self._steps % self.every == 0)
         place = torch.arange(self._places, device=due.device) == self._place(self._steps).unsqueeze(-1)
         truth = next_tensordict.get(self.in_keys[0]).unsqueeze(-2)
-        self._answers = torch.where((place & due.unsqueeze(-1)).unsqueeze(-1), truth, self._answers)
+        self._answers = torch.where((place & due.unsqueeze(-1)).unsqueeze(-1), truth, begun(self._answers))
         return self._show(next_tensordict)
 
     def _place(self, step: Tensor) -> Tensor:
         return step // self.every % self._places
 
     def _show(self, tensordict: TensorDictBase) -> TensorDictBase:
-        assert self._steps is not None
-        assert self._answers is not None
-        place = self._place((self._steps - self.delay).clamp(min=0))[..., None, None]
-        answers = self._answers.gather(-2, place.expand(*place.shape[:-1], self._answers.shape[-1])).squeeze(-2)
+        steps, answers = begun(self._steps), begun(self._answers)
+        place = self._place((steps - self.delay).clamp(min=0))[..., None, None]
+        answers = answers.gather(-2, place.expand(*place.shape[:-1], answers.shape[-1])).squeeze(-2)
         if self.flip:
-            wrong = self._real & (_uniform(self._key, self._steps, self._real.shape[-1]) < self.flip)
+            wrong = self._real & (_uniform(self._key, steps, self._real.shape[-1]) < self.flip)
             answers = answers ^ wrong if answers.dtype == torch.bool else torch.where(wrong, 1 - answers, answers)
         return tensordict.set(self.in_keys[0], answers)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        raise ValueError(
-            "CorruptQAF counts the steps of an environment's episodes, which rows of a replay buffer do not record: "
-            "put it into the environment, after QAFTransform, or pass it to evaluate(evaluator=...)"
-        )
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        assert isinstance(observation_spec, Composite)
-        keys = list(observation_spec.keys(True, True))
-        if any(key not in keys for key in self.in_keys):
-            raise missing_keys(keys, *map(str, self.in_keys))
-        return observation_spec
+        raise ValueError("CorruptQAF does not work on replay buffers; put it into the environment, after QAFTransform")
 
 
 def _uniform(key: Tensor, step: Tensor, width: int) -> Tensor:

@@ -6,9 +6,9 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import Probability, Scale, missing_keys, typed
+from lw_torchrl._util.checks import Probability, Scale, typed
 from lw_torchrl._util.devices import plain
-from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside, read
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans
 from lw_torchrl.language.roles import StepRole
@@ -16,8 +16,6 @@ from lw_torchrl.language.skills import has_direction
 from lw_torchrl.transforms.augmentation import PlanAugmentation, role_table
 
 _KEYS = ("observation", "action", "expert_action", "unclipped_action")
-
-
 _places: dict[tuple[tuple[int, ...], torch.device], Tensor] = {}
 
 
@@ -68,16 +66,14 @@ def random_rotations(number: int, device: torch.device | None = None) -> Tensor:
 class RandomYaw(PlanAugmentation):
     """An augmentation that rotates the positions and actions of each row by a random angle about the vertical axis.
 
-    A policy then learns to move toward the goal, rather than in the directions of the demonstrations. For replay
-    buffers, after a :class:`QAFTransform`, which must see the original scene, because "left of" has a direction.
+    For replay buffers, after a :class:`QAFTransform`, which must see the original scene: "left of" has a direction.
 
     Changes ``observation`` (B, 39), ``action`` (B, 4), and, if present, ``expert_action``, ``unclipped_action``
     (B, 4) and ``("next", "observation")``, all float32. Writes the angle in radians, ``observation_yaw`` (B,) float32,
     and ``("next", "observation_yaw")``, with which features also rotate constant positions. An action's horizontal
     displacement is shortened if it would leave [-1, 1]. Orientations are not rotated, so use features without
     orientations: "differences" or "relative". Angles are drawn from PyTorch's global generator; the angles of repeated
-    rotations add up. TorchRL's losses, except BCLoss, do not pass the angle on to the features, so
-    :class:`~lw_torchrl.OfflineTrainer` rejects these losses.
+    rotations add up. Of TorchRL's losses, only BCLoss passes the angle to the features.
 
     Args:
         scale: standard deviation of the angle, in radians; with 10, the angle is nearly uniform.
@@ -162,9 +158,7 @@ class RandomYaw(PlanAugmentation):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = tensordict.copy()  # replay[:] may return the storage itself
         (source, target), *actions = zip(self.in_keys, self.out_keys, strict=True)
-        observation = tensordict.get(source, None)
-        if observation is None or tensordict.get(actions[0][0], None) is None:
-            raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys[:2]))
+        observation, _ = read(tensordict, self.in_keys[:2])
         angle = self._angle(tensordict, observation)
         tilt = self._tilt(tensordict) if self.tilt else None
         old_yaw, old_tilt = (tensordict.get(key_beside(source, ending), None) for ending in ("_yaw", "_tilt"))

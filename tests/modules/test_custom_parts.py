@@ -10,7 +10,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from users_parts import Closest, Gated, Pictures, Projection
 
 import lw_torchrl as lw
-from lw_torchrl.modules import Concat, MLPDecoder, ObservationFeatures, SkillEncoder
+from lw_torchrl.modules import Concat, ObservationFeatures, SkillEncoder
 
 PLANS = lw.load_plans("MT10")
 
@@ -77,20 +77,6 @@ def test_error_names_the_part_that_cannot_be_saved(options, name, kind, tmp_path
         with pytest.raises(TypeError, match=rf"{name} is a {kind}.*config"):
             save()
     assert not list(tmp_path.iterdir())
-
-
-def test_assigned_part_is_saved_or_refused(tmp_path):
-    path, actor, rows = tmp_path / "policy.safetensors", make_actor(), make_rows(4)
-    actor.decoder = Plain()
-    with pytest.raises(TypeError, match=r"decoder\.network"):
-        lw.save_actor(actor, path)
-    actor.decoder = Gated(5)
-    lw.save_actor(actor, path)
-    assert torch.equal(action_of(lw.load_actor(path), rows), action_of(actor, rows))
-    actor.decoder = MLPDecoder(width=4)
-    actor.decoder.network._options["width"] = 5  # a config that is not the network's
-    with pytest.raises(ValueError, match="description"):
-        lw.save_actor(actor, path)
 
 
 def test_loading_never_imports_a_module_that_a_file_names(tmp_path, monkeypatch):

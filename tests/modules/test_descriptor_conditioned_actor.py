@@ -7,7 +7,6 @@ from tensordict import TensorDict
 
 from lw_torchrl.language.tasks import MT50, TASKS, task_id
 from lw_torchrl.language.text import encode_texts
-from lw_torchrl.modules import ObservationFeatures
 
 
 def state(*shape, seed=0):
@@ -19,20 +18,12 @@ def decoded(actor, vector, observation):
     return actor.decoder.network(torch.cat((latent, actor.features(observation)), -1))
 
 
-@pytest.mark.parametrize("kind", ["raw", "differences", "relative", "both"])
-@pytest.mark.parametrize("shape", [(), (5,), (3, 4)])
-def test_action_for_any_leading_shape(kind, shape):
-    actor = make_descriptor(features=ObservationFeatures(kind))
-    out = actor(state(*shape))
-    assert (actor.in_keys, actor.out_keys) == (["task_id", "observation"], ["task_latent", "features", "action"])
-    assert (out["action"].shape, out["action"].dtype) == ((*shape, 4), torch.float32)
-    assert out["action"].abs().max() < 1
-
-
 @pytest.mark.parametrize("encoder", [None, letters])
 def test_action_by_hand(encoder):
     actor, rows = make_descriptor(text_encoder=encoder), state(8)
     output = action_of(actor, rows)
+    assert (actor.in_keys, actor.out_keys) == (["task_id", "observation"], ["task_latent", "features", "action"])
+    assert torch.equal(action_of(actor, rows.reshape(2, 4)), output.reshape(2, 4, 4))
     for row in range(8):
         vector = (encoder or encode_texts)([TASKS[MT50[rows["task_id"][row]]].description])[0]
         torch.testing.assert_close(output[row], decoded(actor, vector, rows["observation"][row]))

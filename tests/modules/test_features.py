@@ -2,13 +2,14 @@
 
 import pytest
 import torch
+from small_actors import make_rows
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
 import lw_torchrl as lw
 from lw_torchrl.language.layout import METAWORLD
-from lw_torchrl.modules import Concat, Features, FocusFeatures, ObservationFeatures, features
+from lw_torchrl.modules import Concat, FocusFeatures, ObservationFeatures, features
 from lw_torchrl.suites import load_suite
 
 
@@ -43,18 +44,6 @@ def test_differences_to_an_absent_object_are_zero():
     assert not output[1].abs().sum(-1).eq(0).any()
 
 
-@pytest.mark.parametrize(
-    ("kind", "width"), [("raw", 39), ("differences", 56), ("relative", 54), ("both", 95), ("opening", 1), ("none", 0)]
-)
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
-def test_width_of_every_kind_for_any_leading_shape(kind, width, shape):
-    features = ObservationFeatures(kind)
-    output = features(random_observation(*shape))
-    assert features.width == width
-    assert output.shape == (*shape, width)
-    assert output.dtype == torch.float32
-
-
 @pytest.mark.parametrize(("kind", "same"), [("raw", False), ("differences", False), ("relative", True)])
 def test_relative_features_do_not_show_where_the_scene_is(kind, same):
     here = random_observation(20)
@@ -75,21 +64,14 @@ def test_fitted_rows_have_mean_zero_and_deviation_one(kind):
     torch.testing.assert_close(output.std(0, unbiased=False), torch.ones(features.width), atol=1e-3, rtol=0)
 
 
-def test_a_constant_feature_is_centred_and_not_amplified():
-    observation = random_observation(100)
+def test_a_constant_feature_is_centred_and_not_amplified_and_outliers_are_clamped():
+    observation, features = random_observation(100), ObservationFeatures("raw")
     observation[:, 20] = 7.0
-    features = ObservationFeatures("raw")
     fit(features, observation)
-    other = observation[:1].clone()
+    other = torch.full((1, 39), 1e6)
     other[0, 20] = 8.0
-    assert abs(features(observation)[:, 20].max()) < 1e-5
-    assert features(other)[0, 20] == pytest.approx(1.0, abs=1e-5)
-
-
-def test_outliers_are_clamped():
-    features = ObservationFeatures("raw")
-    fit(features, random_observation(100))
-    assert features(torch.full((1, 39), 1e6)).tolist() == [[10.0] * 39]
+    assert features(observation)[:, 20].abs().max() < 1e-5
+    torch.testing.assert_close(features(other)[0], torch.where(torch.arange(39) == 20, 1.0, 10.0))
 
 
 def test_noise_is_added_only_in_training_mode():
@@ -100,7 +82,6 @@ def test_noise_is_added_only_in_training_mode():
     plain = features.eval()(observation)
     assert torch.equal(features(observation), plain)
     added = features.train()(observation) - plain
-    assert added.mean().abs() < 0.01
     assert added.std().item() == pytest.approx(0.3, rel=0.02)
     assert torch.equal(ObservationFeatures("raw").train()(observation), observation)
 
@@ -132,12 +113,7 @@ def test_concatenated_features_keep_their_noise():
     plans = lw.load_plans("MT10")
     parts = ObservationFeatures("raw", 0.5), FocusFeatures(plans)
     module = Concat(*parts)
-    rows = TensorDict(
-        observation=random_observation(4),
-        skill_weights=torch.rand(4, plans.num_steps),
-        task_id=torch.full((4,), lw.task_id("push")),
-        batch_size=[4],
-    )
+    rows = make_rows(4).set("skill_weights", torch.rand(4, plans.num_steps))
     assert (module.in_keys, module.width) == (["observation", "skill_weights", "task_id"], 39 + 18)
     output = module.eval()(rows.copy())
     assert set(output.keys()) == {*rows.keys(), "features"}
@@ -158,20 +134,3 @@ def test_concat_of_modules_with_other_keys():
     for wrong in ((), (nn.Linear(3, 3),)):
         with pytest.raises(TypeError, match="parts must be one or more TensorDict modules"):
             Concat(*wrong)
-
-
-def test_custom_features_only_implement_compute():
-    class Height(Features):
-        width = 1
-
-        def __init__(self, noise=0.0):
-            super().__init__(noise, ["observation"])
-
-        def compute(self, tensordict):
-            return tensordict["observation"][..., 2:3]
-
-    observation = random_observation(200)
-    assert torch.equal(Height()(observation), observation[:, 2:3])
-    assert (Height(0.2).train()(observation) - observation[:, 2:3]).std().item() == pytest.approx(0.2, rel=0.2)
-    with pytest.raises(NotImplementedError, match="Features must override compute"):
-        Features(0.0, ["observation"])(observation)

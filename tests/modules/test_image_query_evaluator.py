@@ -95,19 +95,6 @@ def test_saved_and_loaded_policy_with_evaluator_gives_the_same_bits(tmp_path):
     assert torch.equal(other(states())["qaf_logits"], policy[0](states())["qaf_logits"])
 
 
-def test_custom_encoder_stays_frozen():
-    def frozen():
-        return nn.Sequential(nn.Conv2d(3, 4, 4, 4)).requires_grad_(False)
-
-    IMAGE_ENCODERS["frozen"] = frozen
-    try:
-        evaluator = make(encoder="frozen")
-        assert evaluator(states())["qaf_logits"].requires_grad
-        assert not any(weight.requires_grad for weight in evaluator.network.encoder.parameters())
-    finally:
-        del IMAGE_ENCODERS["frozen"]
-
-
 class TestActing:
     @pytest.fixture(autouse=True)
     def _needs_open_gl(self):

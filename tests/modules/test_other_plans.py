@@ -3,7 +3,6 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl.language.relations import RELATIONS, Comparison
@@ -44,18 +43,10 @@ def state(plans, rows=3):
 @pytest.mark.parametrize("make", ACTORS)
 def test_actor_refuses_truth_of_other_plans(make, other):
     actor = ACTORS[make](PLANS)
-    env = TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(OTHERS[other]))
     with pytest.raises(ValueError, match=REFUSED):
-        actor(env.reset())
-    env.close()
-    env = TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(plans_of(STEPS)))  # equal, not the same
-    assert actor(env.reset())["skill_weights"].shape == (1, 2)
-    env.close()
-
-
-@pytest.mark.parametrize("make", ACTORS)
-def test_without_plan_numbers_nothing_is_refused(make):
-    ACTORS[make](PLANS)(state(OTHERS["another skill"]).exclude("qaf_plan"))
+        actor(state(OTHERS[other]))
+    assert actor(state(OTHERS[other]).exclude("qaf_plan"))["skill_weights"].shape == (3, 2)
+    assert actor(state(plans_of(STEPS)))["skill_weights"].shape == (3, 2), "equal plans, not the same object"
 
 
 def test_each_row_carries_the_number_of_its_plan():
@@ -104,10 +95,3 @@ def test_compiled_actor_refuses_at_run_time():
     wrong["observation"][1, 2] = torch.nan
     with pytest.raises(RuntimeError, match="finite numbers"):
         act(wrong)
-
-
-def test_unknown_task_under_vmap_is_refused():
-    actor = lw.modules.DescriptorConditionedActor(["reach", "push"]).eval()
-    data = TensorDict(observation=torch.zeros(3, 39), task_id=torch.full((3,), lw.task_id("soccer")))
-    with pytest.raises((IndexError, RuntimeError)):
-        torch.vmap(lambda row: actor(row)["action"])(data.auto_batch_size_())

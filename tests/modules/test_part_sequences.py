@@ -2,6 +2,8 @@
 
 import pytest
 import torch
+from small_actors import letters
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
@@ -12,8 +14,6 @@ from lw_torchrl.modules import (
     FocusFeatures,
     SkillMixer,
     Value,
-    describe,
-    from_description,
     plan_trunk,
     transform_of,
 )
@@ -74,26 +74,19 @@ def test_transform_writes_a_renamed_turn():
 def test_renamed_keys_of_an_ensemble_skip_what_a_member_writes_itself():
     member = TensorDictSequential(lw.modules.StateQueryEvaluator(PLANS), lw.PlanConditionedActor(PLANS))
     ensemble = ActorEnsemble([member, lw.PlanConditionedActor(PLANS)])
-    names = {"qaf": "truth"}
-    ensemble.in_keys = [names.get(key, key) for key in ensemble.in_keys]
-    assert ensemble.members[0][1].in_keys[0] == "qaf"
-    assert ensemble.members[1].in_keys[0] == "truth"
+    ensemble.in_keys = ["truth" if key == "qaf" else key for key in ensemble.in_keys]
+    assert [actor.in_keys[0] for actor in (ensemble.members[0][1], ensemble.members[1])] == ["qaf", "truth"]
 
 
-def test_with_plans_keeps_dtype_and_modes():
-    actor = lw.PlanConditionedActor(PLANS).double().train()
+def test_with_plans_keeps_dtype_modes_statistics_and_text_encoder():
+    actor = lw.PlanConditionedActor(PLANS, text_encoder=letters).double().train()
     actor.decoder.eval()
     other = actor.with_plans(REVERSED)
-    assert other.training
-    assert not actor.decoder.training
+    assert (other.training, actor.decoder.training, other.mixer.text_encoder) == (True, False, letters)
+    other.features.fit(TensorDict(observation=torch.rand(50, 39), batch_size=[50]))
+    assert torch.equal(other.features.mean, actor.features.mean)
     observation = torch.zeros(2, 39, dtype=torch.float64)
     assert other(**{**inputs(), "observation": observation})[-1].dtype == torch.float64
-
-
-def test_description_holds_a_setting_that_was_changed_later():
-    actor = lw.PlanConditionedActor(PLANS)
-    actor.decoder.network.squash = False
-    assert from_description(describe(actor)).decoder.network.squash is False
 
 
 def test_features_in_a_sequence_follow_other_plans():

@@ -7,19 +7,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_actors import CANONICAL, make_role_actor
+from small_actors import CANONICAL, make_role_actor, make_rows
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import lw_torchrl as lw
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules import (
-    ActorEnsemble,
-    FocusFeatures,
-    PlanAttention,
-    RoleFeatures,
-    transform_of,
-)
+from lw_torchrl.modules import ActorEnsemble, FocusFeatures, PlanAttention, RoleFeatures, transform_of
 from lw_torchrl.training.normalization import fit_normalization
 
 ZERO_SHOT = lw.canonical_plans(lw.load_plans("MT50", skills="MT10"))
@@ -55,8 +49,11 @@ def test_focus_shows_the_first_and_the_last_clause_with_two_objects(observation)
     output = compared(focus_of("push", condition), observation)
     torch.testing.assert_close(output[:, 0], observation[:, OBJECT] - observation[:, HAND])
     torch.testing.assert_close(output[:, 1], observation[:, GOAL] - observation[:, OBJECT])
-    output = compared(focus_of("push", "the gripper is not above the puck"), observation)
+    focus = focus_of("push", "the gripper is not above the puck")
+    output = compared(focus, observation)
     assert torch.equal(output[:, 0], output[:, 1])
+    squashed = focus(observation, torch.ones(5, 1), torch.full((5,), lw.task_id("push")))[:, 6:]
+    torch.testing.assert_close(squashed, torch.cat([torch.tanh(output.flatten(1) / unit) for unit in (0.02, 0.1)], -1))
     assert not compared(focus_of("push", "the gripper is open"), observation).any()
 
 
@@ -80,23 +77,10 @@ def test_focus_mixes_steps_by_attention(seed):
     torch.testing.assert_close(mixed, weights[:, 0, None, None] * each[0] + weights[:, 1, None, None] * each[1])
 
 
-def test_focus_squashes_positions_at_two_scales(observation):
-    focus = focus_of("push", "the gripper is above the puck")
-    output = focus(observation, torch.ones(5, 1), torch.full((5,), lw.task_id("push")))
-    position = output[:, :6] / 10
-    torch.testing.assert_close(output[:, 6:12], torch.tanh(position / 0.02))
-    torch.testing.assert_close(output[:, 12:], torch.tanh(position / 0.1))
-
-
 @pytest.mark.parametrize("kind", [FocusFeatures, RoleFeatures])
 def test_any_leading_shape_and_noise_in_training_mode(kind):
     features = kind(CANONICAL, noise=0.1).eval()
-    rows = TensorDict(
-        observation=torch.randn(2, 3, 39),
-        skill_weights=torch.rand(2, 3, CANONICAL.num_steps),
-        task_id=torch.full((2, 3), lw.task_id("push")),
-        batch_size=[2, 3],
-    )
+    rows = make_rows(2, 3, plans=CANONICAL).set("skill_weights", torch.rand(2, 3, CANONICAL.num_steps))
     once = features(rows.copy())["features"]
     assert once.shape == (2, 3, features.width)
     torch.testing.assert_close(features(rows.reshape(6))["features"].reshape(2, 3, -1), once)
@@ -106,8 +90,8 @@ def test_any_leading_shape_and_noise_in_training_mode(kind):
 # ---- RoleFeatures
 
 
-def roles_of(plans=CANONICAL, **options):
-    return RoleFeatures(plans, **options).eval()
+def make_roles(plans=CANONICAL):
+    return RoleFeatures(plans).eval()
 
 
 def in_step(plans, task, step, number=5, seed=0):
@@ -120,10 +104,7 @@ def in_step(plans, task, step, number=5, seed=0):
 
 def written(roles, seen, **more):
     """Return the features (B, 12) of inputs from :func:`in_step`."""
-    observation, weights, rows = seen
-    ids = torch.tensor([lw.task_id(task) for task in roles.tables.index.tasks])[rows]
-    rows = TensorDict(observation=observation, skill_weights=weights, task_id=ids, batch_size=[len(ids)])
-    return roles(rows.update(more))["features"]
+    return roles(rows_of(roles.plans, seen).set("skill_weights", seen[1]).update(more))["features"]
 
 
 def rows_of(plans, seen):
@@ -141,7 +122,7 @@ def rows_of(plans, seen):
     ],
 )
 def test_position_points_from_the_moved_object_to_the_target(task, step, way):
-    seen, roles = in_step(ZERO_SHOT, task, step), roles_of(ZERO_SHOT)
+    seen, roles = in_step(ZERO_SHOT, task, step), make_roles(ZERO_SHOT)
     roles.demonstrated.fill_(True)
     torch.testing.assert_close(roles.positions(*seen)[:, 0], way(seen[0]))
 
@@ -152,7 +133,7 @@ def test_position_points_from_the_moved_object_to_the_target(task, step, way):
      ("window-open", 0, (1.0, 0.0, 0.0)), ("button-press-topdown", 2, (0.0, 0.0, -1.0))],
 )  # fmt: skip
 def test_direction_of_a_step(task, step, direction):
-    roles, seen = roles_of(), in_step(CANONICAL, task, step)
+    roles, seen = make_roles(), in_step(CANONICAL, task, step)
     assert torch.equal(roles.directions(*seen), torch.tensor(direction).expand(5, 3))
     assert torch.equal(written(roles, seen)[:, 9:], torch.tensor(direction).expand(5, 3))
 
@@ -164,7 +145,7 @@ def test_direction_to_the_goal_starts_at_the_object_and_turns_with_the_scene():
     ]
     plans = lw.canonical_plans(Plans([ConditionalPlan.from_pairs("push", pairs)]))
     (number,) = (n for n, step in enumerate(plans["push"].steps) if step.role.verb == "push")
-    roles, (observation, weights, rows) = roles_of(plans), in_step(plans, "push", number)
+    roles, (observation, weights, rows) = make_roles(plans), in_step(plans, "push", number)
     ahead = torch.nn.functional.normalize(observation[:, 36:39] - observation[:, 4:7], dim=-1)
     torch.testing.assert_close(roles.directions(observation, weights, rows), ahead)
     turned = lw.RandomYaw(0.7)(TensorDict(observation=observation, action=torch.zeros(5, 4), batch_size=[5]))
@@ -185,12 +166,12 @@ def test_object_that_is_lifted_has_a_target_above_it():
     plans = lw.canonical_plans(Plans([ConditionalPlan.from_pairs("push", pairs)]))
     (number,) = (n for n, step in enumerate(plans["push"].steps) if step.role.verb == "move")
     seen = in_step(plans, "push", number)
-    torch.testing.assert_close(roles_of(plans).positions(*seen)[:, 0], torch.tensor([0.0, 0.0, 0.15]).expand(5, 3))
-    assert not roles_of(plans).directions(*seen).any()
+    torch.testing.assert_close(make_roles(plans).positions(*seen)[:, 0], torch.tensor([0.0, 0.0, 0.15]).expand(5, 3))
+    assert not make_roles(plans).directions(*seen).any()
 
 
 def test_position_is_clipped_at_25_cm():
-    roles = roles_of()
+    roles = make_roles()
     observation, *rest = in_step(CANONICAL, "push", 0)
     observation[:, :3] = observation[:, 4:7] + torch.tensor([0.3, -0.4, 0.0])
     far = written(roles, (observation, *rest))
@@ -219,7 +200,7 @@ def carried(beside, below):
     ],
 )
 def test_without_demonstrations_a_carried_object_is_lifted_first(beside, below, expected):
-    roles, seen = roles_of(), carried(beside, below)
+    roles, seen = make_roles(), carried(beside, below)
     torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor(expected), atol=1e-5, rtol=0)
     roles.fit(rows_of(CANONICAL, in_step(CANONICAL, "push", 0)))
     assert roles.demonstrated.tolist() == [task == "push" for task in roles.tables.index.tasks]
@@ -227,7 +208,7 @@ def test_without_demonstrations_a_carried_object_is_lifted_first(beside, below, 
 
 
 def test_a_sliding_object_is_not_lifted():
-    roles = roles_of()
+    roles = make_roles()
     observation, weights, rows = in_step(CANONICAL, "peg-insert-side", 4)
     before = roles.positions(observation, weights, rows)
     roles.demonstrated.fill_(True)
@@ -242,7 +223,11 @@ def demonstrations(task):
 
 
 def test_contact_is_the_hand_position_while_it_acts():
-    roles, rows = roles_of(), demonstrations("drawer-open")
+    roles, rows = make_roles(), demonstrations("drawer-open")
+    roles.fit(demonstrations("button-press-topdown"))
+    assert not roles.contact.any(), "a button is pressed from above"
+    assert roles.demonstrated.sum() == 1
+    roles = make_roles()
     roles.fit(rows)
     attended = PlanAttention(CANONICAL)(lw.QAFTransform(CANONICAL)(rows.copy()))["skill_weights"]
     (pull,) = (n for n, step in enumerate(CANONICAL["drawer-open"].steps) if step.role.verb == "pull")
@@ -251,24 +236,14 @@ def test_contact_is_the_hand_position_while_it_acts():
     row = row_of(CANONICAL, "drawer-open")
     expected = (observation[:, HAND] - observation[:, OBJECT]).median(0).values
     torch.testing.assert_close(roles.contact[row], expected)
-    assert roles.contact.count_nonzero() == 3
-    assert roles.demonstrated.tolist() == [task == "drawer-open" for task in roles.tables.index.tasks]
-    assert roles.fitted
     observation, *rest = in_step(CANONICAL, "drawer-open", pull)
     observation[:, HAND] = observation[:, OBJECT] + roles.contact[row]
     at_contact = roles.positions(observation, *rest)
     torch.testing.assert_close(at_contact, torch.zeros_like(at_contact), atol=1e-5, rtol=0)
 
 
-def test_button_pressed_from_above_has_no_contact():
-    roles = roles_of()
-    roles.fit(demonstrations("button-press-topdown"))
-    assert not roles.contact.any()
-    assert roles.demonstrated.sum() == 1
-
-
 def test_contacts_affect_neither_carried_objects_nor_named_points():
-    roles = roles_of(ZERO_SHOT)
+    roles = make_roles(ZERO_SHOT)
     roles.contact.fill_(1.0)
     roles.demonstrated.fill_(True)
     carried, point = in_step(ZERO_SHOT, "push", 3), in_step(ZERO_SHOT, "coffee-pull", 0)
@@ -280,7 +255,7 @@ def test_contacts_affect_neither_carried_objects_nor_named_points():
 @pytest.mark.parametrize(("task", "step"), [("push", 0), ("peg-insert-side", 4), ("drawer-open", 2)])
 def test_turned_scene_turns_positions_fixed_places_and_contacts(task, step):
     """The hole of peg-insert-side has a fixed x, which no turned observation holds."""
-    roles = roles_of()
+    roles = make_roles()
     roles.contact.copy_(torch.rand(roles.contact.shape))
     observation, weights, rows = in_step(CANONICAL, task, step)
     sample = TensorDict(observation=observation, action=torch.zeros(5, 4), batch_size=[5])
@@ -288,14 +263,13 @@ def test_turned_scene_turns_positions_fixed_places_and_contacts(task, step):
     yaw = turned["observation_yaw"]
     before = roles.positions(observation, weights, rows)[:, 0]
     after = roles.positions(turned["observation"], weights, rows, yaw)[:, 0]
-    x, y = before[:, 0], before[:, 1]
-    torch.testing.assert_close(after[:, 0], yaw.cos() * x - yaw.sin() * y)
-    torch.testing.assert_close(after[:, 1], yaw.sin() * x + yaw.cos() * y)
-    torch.testing.assert_close(after[:, 2], before[:, 2])
+    x, y, z = before.unbind(-1)
+    turned_by_hand = torch.stack([yaw.cos() * x - yaw.sin() * y, yaw.sin() * x + yaw.cos() * y, z], -1)
+    torch.testing.assert_close(after, turned_by_hand)
 
 
 def test_target_offset_moves_the_position():
-    roles, seen = roles_of(), in_step(CANONICAL, "drawer-open", 2)
+    roles, seen = make_roles(), in_step(CANONICAL, "drawer-open", 2)
     offset = torch.full((5, 3), 0.01)
     plain, moved = written(roles, seen), written(roles, seen, target_offset=offset)
     position = roles.positions(*seen)[:, 0] + offset
@@ -304,46 +278,28 @@ def test_target_offset_moves_the_position():
     assert torch.equal(moved[:, 9:], plain[:, 9:])
 
 
-def make_replay(task="drawer-open"):
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(400), batch_size=8)
-    replay.extend(demonstrations(task))
-    return replay
-
-
-def test_training_fits_contacts_and_the_policy_file_holds_them(tmp_path):
-    actor, replay = make_role_actor(), make_replay()
-    replay.append_transform(transform_of(actor))
-    config = lw.BehavioralCloningConfig(steps=2, batch_size=8)
-    lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
-    contact, row = actor.features.contact, row_of(CANONICAL, "drawer-open")
-    assert contact[row].any()
-    lw.save_actor(actor, tmp_path / "policy.safetensors")
-    loaded = lw.load_actor(tmp_path / "policy.safetensors").features
-    assert torch.equal(loaded.contact, contact)
-    assert loaded.demonstrated.tolist() == [task == "drawer-open" for task in loaded.tables.index.tasks]
-    wider = actor.with_plans(ZERO_SHOT).features
-    assert wider.demonstrated.tolist() == [task == "drawer-open" for task in wider.tables.index.tasks]
-    assert torch.equal(wider.contact[row_of(ZERO_SHOT, "drawer-open")], contact[row])
-    assert wider.contact.count_nonzero() == contact.count_nonzero()
-    ensemble = ActorEnsemble([make_role_actor(seed=seed) for seed in range(2)])
-    fit_normalization(ensemble, replay)
-    assert all(torch.equal(member.features.contact, contact) for member in ensemble.members)
-
-
-def test_actors_with_the_same_weights_share_contacts_whichever_is_fitted():
-    actor, replay, row = make_role_actor(), make_replay(), row_of(CANONICAL, "drawer-open")
+def test_training_fits_contacts_that_actors_with_the_same_weights_and_the_policy_file_share(tmp_path):
+    actor, row, wide_row = (make_role_actor(), *(row_of(plans, "drawer-open") for plans in (CANONICAL, ZERO_SHOT)))
     copies = [pickle.loads(pickle.dumps(actor)), deepcopy(actor)]
     wider = actor.with_plans(ZERO_SHOT)
     back = wider.with_plans(CANONICAL)
-    fit_normalization(back, replay)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(400), batch_size=8, transform=transform_of(actor))
+    replay.extend(demonstrations("drawer-open"))
+    config = lw.BehavioralCloningConfig(steps=2, batch_size=8)
+    lw.BehavioralCloningTrainer(back, replay, config, progress=False).train()
     contact = back.features.contact
     assert contact[row].any()
-    assert torch.equal(actor.features.contact, contact)
-    assert torch.equal(wider.features.contact[row_of(ZERO_SHOT, "drawer-open")], contact[row])
-    for each in (actor, wider, back):
-        assert each.features.fitted
-        assert each.features.demonstrated.sum() == 1
-    for other in copies:
-        assert not other.features.fitted
-        fit_normalization(other, replay)
-        assert torch.equal(other.features.contact, contact)
+    assert torch.equal(wider.features.contact[wide_row], contact[row])
+    lw.save_actor(back, tmp_path / "policy.safetensors")
+    loaded = lw.load_actor(tmp_path / "policy.safetensors")
+    ensemble = ActorEnsemble([make_role_actor(seed=seed) for seed in range(2)])
+    assert not any(each.features.fitted for each in (*copies, *ensemble.members))
+    for each in (*copies, ensemble):
+        fit_normalization(each, replay)
+    for each in (actor, back, loaded, *copies, *ensemble.members):
+        assert torch.equal(each.features.contact, contact)
+    for each in (actor, wider, back, loaded):
+        features = each.features
+        assert features.fitted
+        assert features.demonstrated.tolist() == [task == "drawer-open" for task in features.tables.index.tasks]
+        assert features.contact.count_nonzero() == 3

@@ -67,15 +67,8 @@ def test_padding_gets_no_weight():
 
 
 def test_plans_of_mt10_succeed():
-    result = lw.evaluate(
-        lw.ScriptedSkillActor(PLANS),
-        tasks="MT10",
-        episodes_per_task=5,
-        seed=31,
-        noise_scale=0.0,
-        stop_at_success=True,
-        progress=False,
-    )
+    options = {"noise_scale": 0.0, "stop_at_success": True, "progress": False}
+    result = lw.evaluate(lw.ScriptedSkillActor(PLANS), tasks="MT10", episodes_per_task=5, seed=31, **options)
     assert result.mean_success >= 0.98, result.table()
 
 

@@ -2,32 +2,16 @@
 
 import pytest
 import torch
-from small_actors import (
-    CANONICAL,
-    action_of,
-    make_actor,
-    make_descriptor,
-    make_role_actor,
-    make_rows,
-    rows_for,
-)
+from small_actors import CANONICAL, action_of, make_actor, make_descriptor, make_role_actor, make_rows, rows_for
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
 import lw_torchrl as lw
+from lw_torchrl import modules as m
 from lw_torchrl.language.layout import METAWORLD, Layout, Slot
 from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules import (
-    ActorEnsemble,
-    Concat,
-    DecidedGripper,
-    DemonstratedActor,
-    ObservationFeatures,
-    RoleFeatures,
-    TransferredActor,
-)
 from lw_torchrl.modules.wrappers import decided
 from lw_torchrl.suites import load_suite
 
@@ -46,17 +30,13 @@ def with_effort(actor, effort):
 # ---- ActorEnsemble
 
 
-def make_members(kind="plan"):
-    if kind == "description":
-        return [make_descriptor(seed=seed) for seed in range(3)]
-    features = (ObservationFeatures(kind) for kind in ("differences", "relative", "both"))
-    return [make_actor(seed=seed, features=each) for seed, each in enumerate(features)]
-
-
 @pytest.mark.parametrize("kind", ["plan", "description"])
 def test_ensemble_action_is_the_mean_of_its_members(kind):
-    members, rows = make_members(kind), make_rows(7)
-    ensemble = ActorEnsemble(members).eval()
+    make = make_actor if kind == "plan" else make_descriptor
+    kinds = ("differences", "relative", "both")
+    members = [make(seed=seed, features=m.ObservationFeatures(name)) for seed, name in enumerate(kinds)]
+    rows = make_rows(7)
+    ensemble = m.ActorEnsemble(members).eval()
     output = ensemble(rows.copy())
     actions = [action_of(member, rows) for member in members]
     assert not torch.allclose(actions[0], actions[1], atol=1e-3)
@@ -68,7 +48,7 @@ def test_ensemble_action_is_the_mean_of_its_members(kind):
 
 
 def test_any_modules_can_be_members():
-    ensemble, rows = ActorEnsemble([PLAIN, PLAIN]), make_rows(3)
+    ensemble, rows = m.ActorEnsemble([PLAIN, PLAIN]), make_rows(3)
     assert ensemble.in_keys == ["observation"]
     torch.testing.assert_close(action_of(ensemble, rows), action_of(PLAIN, rows))
 
@@ -78,8 +58,8 @@ def test_any_modules_can_be_members():
 
 @pytest.mark.parametrize("make", [make_actor, make_descriptor])
 def test_the_gripper_is_decided_only_when_the_policy_acts(make):
-    actor, rows = make(features=ObservationFeatures()), make_rows(200)
-    policy = DecidedGripper(actor)
+    actor, rows = make(features=m.ObservationFeatures()), make_rows(200)
+    policy = m.DecidedGripper(actor)
     assert (policy.in_keys, policy.out_keys) == (actor.in_keys, actor.out_keys)
     before, after = action_of(policy.train(), rows), action_of(policy.eval(), rows)
     assert before[:, 3].unique().numel() > 2
@@ -89,15 +69,15 @@ def test_the_gripper_is_decided_only_when_the_policy_acts(make):
 
 @pytest.mark.parametrize(("effort", "done"), [(0.29, -1.0), (0.31, 1.0), (-0.9, -1.0), (1e-3, -1.0)])
 def test_gripper_closes_above_the_layouts_effort(effort, done):
-    policy = DecidedGripper(with_effort(make_actor(), effort)).eval()
+    policy = m.DecidedGripper(with_effort(make_actor(), effort)).eval()
     assert (action_of(policy, make_rows(10))[:, 3] == done).all()
-    assert (action_of(DecidedGripper(policy.actor, -1.0).eval(), make_rows(10))[:, 3] == 1.0).all()
+    assert (action_of(m.DecidedGripper(policy.actor, -1.0).eval(), make_rows(10))[:, 3] == 1.0).all()
 
 
 @pytest.mark.parametrize(("efforts", "done"), [((0.9, 0.35, -0.9), 1.0), ((0.9, 0.2, 0.2), -1.0)])
 def test_majority_of_an_ensemble_decides(efforts, done):
-    members = [DecidedGripper(with_effort(make_actor(), effort)) for effort in efforts]
-    policy = DecidedGripper(ActorEnsemble(members), 0.0).eval()
+    members = [m.DecidedGripper(with_effort(make_actor(), effort)) for effort in efforts]
+    policy = m.DecidedGripper(m.ActorEnsemble(members), 0.0).eval()
     assert (action_of(policy, make_rows(10))[:, 3] == done).all()
     assert action_of(policy.train(), make_rows(10))[:, 3].abs().max() < 1
 
@@ -121,11 +101,10 @@ def seven_plans():
 @pytest.mark.parametrize("members", [1, 3])
 def test_gripper_of_another_robot_is_decided_by_the_first_robots_effort(effort, done, members):
     """Its effort has another place and sign; an effort of 0.2 closes neither gripper."""
-    one = DecidedGripper(with_effort(make_role_actor(), effort))
-    actor = one if members == 1 else DecidedGripper(ActorEnsemble([one] * members), 0.0)
-    policy = TransferredActor(actor, seven_plans()).eval()
-    state = TensorDict(observation=torch.rand(4, 16), task_id=torch.full((4,), lw.task_id(PUCK.name)), batch_size=[4])
-    state = lw.QAFTransform(policy.plans)(state)
+    one = m.DecidedGripper(with_effort(make_role_actor(), effort))
+    actor = one if members == 1 else m.DecidedGripper(m.ActorEnsemble([one] * members), 0.0)
+    policy = m.TransferredActor(actor, seven_plans()).eval()
+    state = state_of(policy, *[PUCK.name] * 4)
     for each in (policy, policy.with_plans(seven_plans()).eval()):
         assert (action_of(each, state)[:, SEVEN.effort] == done).all()
     assert action_of(one.eval(), rows_for(one, 2))[0, 3] == (1.0 if effort > 0.3 else -1.0)
@@ -142,24 +121,21 @@ def test_layout_places_the_effort():
 # ---- DemonstratedActor
 
 MT50 = lw.canonical_plans(lw.load_plans("MT50"))
-SEEN = ("push", "reach")
 
 
-def make_demonstrated(seen=SEEN, **keys):
-    plain = {"in_keys": keys["in_keys"][1:]} if keys else {}
-    return DemonstratedActor(make_descriptor(seen, **plain), make_role_actor(MT50, **keys)).eval()
+def make_demonstrated():
+    return m.DemonstratedActor(make_descriptor(("push", "reach")), make_role_actor(MT50)).eval()
 
 
-def state_of(policy, tasks=("push", "hammer", "reach", "soccer", "push")):
+def state_of(policy, *tasks):
     ids = torch.tensor([lw.task_id(task) for task in tasks])
-    return lw.QAFTransform(policy.plans)(
-        TensorDict(observation=torch.rand(len(tasks), 39), task_id=ids, batch_size=[len(tasks)])
-    )
+    observation = torch.rand(len(tasks), policy.plans.layout.size)
+    return lw.QAFTransform(policy.plans)(TensorDict(observation=observation, task_id=ids, batch_size=[len(tasks)]))
 
 
 def test_each_row_acts_by_the_policy_of_its_task():
     policy = make_demonstrated()
-    state = state_of(policy)
+    state = state_of(policy, "push", "hammer", "reach", "soccer", "push")
     output, seen = policy(state.copy()), torch.tensor([True, False, True, False, True])
     torch.testing.assert_close(output["action"][seen], action_of(policy.demonstrated, state[seen]))
     others = policy.others(state.copy())
@@ -169,26 +145,14 @@ def test_each_row_acts_by_the_policy_of_its_task():
     assert torch.equal(output["task_id"], state["task_id"])
     assert (policy.plans, policy.tasks) == (policy.others.plans, tuple(MT50))
     for tasks, part in ((("push", "reach"), policy.demonstrated), (("hammer", "soccer"), policy.others)):
-        state = state_of(policy, tasks)
+        state = state_of(policy, *tasks)
         torch.testing.assert_close(action_of(policy, state), action_of(part, state))
-
-
-def test_with_plans_changes_only_the_policy_with_plans():
-    policy = make_demonstrated()
-    steps = [("the gripper is open", "grab the puck"), ("the gripper is closed", "bring the puck to the goal")]
-    other = policy.with_plans(lw.canonical_plans(Plans([ConditionalPlan.from_pairs("push", steps), MT50["hammer"]])))
-    assert (other.training, other.tasks) == (False, ("hammer", "push"))
-    assert other.demonstrated is policy.demonstrated
-    assert other.others.decoder is policy.others.decoder
-    state = state_of(other, ("push", "hammer"))
-    assert torch.equal(action_of(other, state)[1], action_of(other.others, state)[1])
-    torch.testing.assert_close(action_of(other, state)[:1], action_of(policy.demonstrated, state[:1]))
 
 
 def test_another_suite_leaves_only_the_policy_with_plans():
     fetch = lw.canonical_plans(load_suite("fetch").plans)
     assert type(make_demonstrated().with_plans(fetch)) is lw.PlanConditionedActor
-    assert TransferredActor(make_demonstrated(), fetch).tasks == tuple(fetch)
+    assert m.TransferredActor(make_demonstrated(), fetch).tasks == tuple(fetch)
 
 
 # ---- TransferredActor
@@ -196,32 +160,27 @@ def test_another_suite_leaves_only_the_policy_with_plans():
 
 def test_full_displacement_stays_full_or_keeps_its_metres():
     fetch = lw.canonical_plans(load_suite("fetch").plans)
-    features = Concat(ObservationFeatures("opening"), RoleFeatures(CANONICAL))
+    features = m.Concat(m.ObservationFeatures("opening"), m.RoleFeatures(CANONICAL))
     actor = make_actor(CANONICAL, features=features)
     rows = torch.rand(20, 4) - 0.5
     reach = METAWORLD.reach / fetch.layout.reach
     for speed, ratio in ((None, 1.0), (1.0, reach), (2.0, 2.0 * reach)):
-        moved = TransferredActor(actor, fetch, speed=speed)
+        moved = m.TransferredActor(actor, fetch, speed=speed)
         output = moved.converted(rows)
         expected = (rows[:, METAWORLD.displaced("test")] * ratio).clamp(-1, 1)
         torch.testing.assert_close(output[:, fetch.layout.displaced("test")], expected)
         assert {id(one) for one in moved.parameters()} == {id(one) for one in actor.parameters()}
-    state = TensorDict(
-        observation=torch.rand(3, fetch.layout.size),
-        task_id=torch.full((3,), lw.task_id("fetch/push")),
-        batch_size=[3],
-    )
-    assert action_of(moved, lw.QAFTransform(fetch)(state)).abs().max() <= 1
+    assert action_of(moved, state_of(moved, *["fetch/push"] * 3)).abs().max() <= 1
 
 
 # ---- all
 
 
 WRAPPED = {
-    "ensemble": lambda: ActorEnsemble(make_members()).eval(),
-    "decided": lambda: DecidedGripper(ActorEnsemble([DecidedGripper(make_actor())] * 2), 0.0).eval(),
+    "ensemble": lambda: m.ActorEnsemble([make_actor(seed=seed) for seed in range(3)]).eval(),
+    "decided": lambda: m.DecidedGripper(m.ActorEnsemble([m.DecidedGripper(make_actor())] * 2), 0.0).eval(),
     "demonstrated": make_demonstrated,
-    "transferred": lambda: TransferredActor(make_role_actor(), CANONICAL, speed=0.5).eval(),
+    "transferred": lambda: m.TransferredActor(make_role_actor(), CANONICAL, speed=0.5).eval(),
 }
 
 

@@ -12,8 +12,6 @@ import lw_torchrl as lw
 from lw_torchrl.modules.policy import transform_of
 from lw_torchrl.transforms import FallbackTurns
 
-HAND, OBJECT = slice(0, 3), slice(4, 7)
-
 
 def turns_of(ways, rows=None, **options):
     """Return the turn after each step of observations (T, B, 39); the first is a reset's."""
@@ -32,39 +30,23 @@ def standing(steps, rows=1):
     return torch.zeros(steps + 1, rows, 39)
 
 
-def test_turn_ends_after_patience_steps_without_motion():
-    assert turns_of(standing(7), patience=3, longest=99).flatten().tolist() == [0, 0, 0, 1, 1, 1, 2, 2]
+TURNS = {
+    "no motion": (lambda ways: None, {"patience": 3}, [0, 0, 0, 1, 1, 1, 2, 2]),
+    "hand: 2 cm in two steps": (lambda ways: ways[:, 0, 0].copy_(0.011 * torch.arange(8)), {"patience": 3}, [0] * 8),
+    "object": (lambda ways: ways[:, 0, 4].copy_(0.011 * torch.arange(8)), {"patience": 3}, [0] * 8),
+    "1.7 cm": (lambda ways: ways[1::2, 0, :3].fill_(0.01), {"patience": 3}, [0, 0, 0, 1, 1, 1, 2, 2]),
+    "longest": (lambda ways: ways[::2, 0, 0].fill_(0.3), {"patience": 3, "longest": 3}, [0, 0, 0, 1, 1, 1, 2, 2]),
+    "release": (lambda ways: ways[5::2, 0, :3].fill_(0.3), {"patience": 2, "release": 4}, [0, 0, 1, 1, 1, 1, 2, 2]),
+    "goal": (lambda ways: ways[:, 0, 36].copy_(torch.arange(8)), {"patience": 3}, [0, 0, 0, 1, 1, 1, 2, 2]),
+}
 
 
-@pytest.mark.parametrize("part", [HAND, OBJECT], ids=["hand", "object"])
-def test_motion_of_the_hand_or_an_object_prolongs_a_turn(part):
-    ways = standing(12)
-    ways[:, 0, part.start] = 0.011 * torch.arange(13)  # 2 cm in two steps
-    assert turns_of(ways, patience=3, longest=99).max() == 0
-
-
-def test_small_motions_do_not_count():
-    ways = standing(6)
-    ways[1::2, 0, HAND] += 0.01  # 1.7 cm
-    assert turns_of(ways, patience=3, longest=99).flatten().tolist() == [0, 0, 0, 1, 1, 1, 2]
-
-
-def test_turn_ends_after_its_maximum_length():
-    ways = standing(8)
-    ways[::2, 0, 0] = 0.3
-    assert turns_of(ways, patience=3, longest=4, release=4).flatten().tolist() == [0, 0, 0, 0, 1, 1, 1, 1, 2]
-
-
-def test_letting_go_takes_its_time_steps_whether_something_moves_or_not():
-    ways = standing(9)
-    ways[5::2, 0, HAND] = 0.3
-    assert turns_of(ways, patience=2, longest=99, release=5).flatten().tolist() == [0, 0, 1, 1, 1, 1, 1, 2, 2, 2]
-
-
-def test_motion_of_the_goal_does_not_count():
-    ways = standing(4)
-    ways[..., 36] = torch.arange(5.0).unsqueeze(-1)
-    assert turns_of(ways, patience=2, longest=99).max() == 2
+@pytest.mark.parametrize("name", TURNS)
+def test_turn_ends_without_motion_or_after_its_maximum_length(name):
+    move, options, expected = TURNS[name]
+    ways = standing(7)
+    move(ways)
+    assert turns_of(ways, **{"longest": 99, **options}).flatten().tolist() == expected
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 9))
@@ -89,13 +71,6 @@ def test_reset_rows_start_with_turn_0():
     assert transform._reset(begun, state.clone())["turn"].tolist() == [0, 1]
 
 
-def test_specs():
-    env = TransformedEnv(lw.LanguageWorldEnv(["reach", "push"], num_envs=4), FallbackTurns(patience=2))
-    check_env_specs(env)
-    assert env.reset()["turn"].dtype == torch.int64
-    env.close()
-
-
 def test_buffer_rows_keep_their_turn():
     rows = TensorDict(observation=torch.zeros(2, 39), turn=torch.tensor([0, 3]), batch_size=[2])
     assert FallbackTurns()(rows.clone())["turn"].tolist() == [0, 3]
@@ -111,6 +86,7 @@ def test_policy_with_fallback_steps_on_rows_and_in_an_environment():
     assert rows["turn"].tolist() == [0] * 4
     turns = lw.QAFTransform(plans), FallbackTurns(patience=3, release=3)
     env = TransformedEnv(lw.LanguageWorldEnv("push", max_steps=12), Compose(*turns))
+    check_env_specs(env)
     still = lambda td: actor(td).set("action", torch.zeros(1, 4))  # noqa: E731
     rollout = env.rollout(12, still)
     fallback = torch.tensor([step.role.fallback for step in plans["push"].steps])

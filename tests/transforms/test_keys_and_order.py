@@ -3,17 +3,9 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl import envs as o
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import (
-    Compose,
-    DTypeCastTransform,
-    ObservationNorm,
-    RenameTransform,
-    SerialEnv,
-    StepCounter,
-    TransformedEnv,
-    VecNormV2,
-)
+from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv
 
 import lw_torchrl as lw
 
@@ -29,8 +21,8 @@ def queries(**options) -> lw.QAFTransform:
     return lw.QAFTransform(PLANS, **options)
 
 
-def norm(key="observation", out="observation") -> ObservationNorm:
-    return ObservationNorm(loc=0.0, scale=2.0, in_keys=[key], out_keys=[out])
+def norm(key="observation", out="observation") -> o.ObservationNorm:
+    return o.ObservationNorm(loc=0.0, scale=2.0, in_keys=[key], out_keys=[out])
 
 
 def rows(number: int = 6) -> TensorDict:
@@ -40,17 +32,12 @@ def rows(number: int = 6) -> TensorDict:
     return sample.set("next", TensorDict({"observation": following}, [number]))
 
 
+MOVED = {"observation": "state", "task_id": "task", "action": "move"}
+
+
 def nested(sample: TensorDict) -> TensorDict:
-    moved = {
-        ("robot", "state"): sample["observation"],
-        ("robot", "task"): sample["task_id"],
-        ("robot", "move"): sample["action"],
-        ("next", "robot", "state"): sample["next", "observation"],
-    }
-    result = TensorDict({}, sample.batch_size)
-    for key, value in moved.items():
-        result.set(key, value.clone())
-    return result
+    result = TensorDict({("robot", new): sample[old].clone() for old, new in MOVED.items()}, sample.batch_size)
+    return result.set(("next", "robot", "state"), sample["next", "observation"].clone())
 
 
 def test_nested_keys_on_a_sample():
@@ -61,31 +48,33 @@ def test_nested_keys_on_a_sample():
     assert "qaf" not in moved.keys(True)
 
 
+def turned(sample: TensorDict, **keys) -> TensorDict:
+    torch.manual_seed(0)
+    return lw.RandomYaw(0.5, **keys)(sample.clone())
+
+
 def test_random_yaw_with_renamed_keys():
     sample = rows()
-    torch.manual_seed(0)
-    expected = lw.RandomYaw(0.5)(sample.clone())
-    torch.manual_seed(0)
+    expected = turned(sample)
     keys = [("robot", "state"), ("robot", "move"), ("robot", "expert"), ("robot", "unclipped")]
-    result = lw.RandomYaw(0.5, in_keys=keys)(nested(sample))
-    assert torch.equal(result["robot", "state"], expected["observation"])
-    assert torch.equal(result["next", "robot", "state"], expected["next", "observation"])
-    assert torch.equal(result["robot", "move"], expected["action"])
-    torch.manual_seed(0)
-    beside = lw.RandomYaw(0.5, out_keys=["turned", "turned_action", "turned_expert", "turned_wish"])(sample.clone())
-    assert torch.equal(beside["observation"], sample["observation"])
-    assert torch.equal(beside["action"], sample["action"])
-    assert torch.equal(beside["turned"], expected["observation"])
-    assert torch.equal(beside["next", "turned"], expected["next", "observation"])
-    assert torch.equal(beside["turned_action"], expected["action"])
+    result = turned(nested(sample), in_keys=keys)
+    beside = turned(sample, out_keys=["turned", "turned_action", "turned_expert", "turned_wish"])
+    assert (beside.select(*sample.keys(True, True)) == sample).all()
+    for key, inside, outside in (
+        ("observation", ("robot", "state"), "turned"),
+        (("next", "observation"), ("next", "robot", "state"), ("next", "turned")),
+        ("action", ("robot", "move"), "turned_action"),
+    ):
+        assert torch.equal(result[inside], expected[key])
+        assert torch.equal(beside[outside], expected[key])
 
 
 BEFORE = {
     "ObservationNorm": norm,
-    "VecNormV2": lambda: VecNormV2(in_keys=["observation"]),
+    "VecNormV2": lambda: o.VecNormV2(in_keys=["observation"]),
     "Compose": lambda: Compose(StepCounter(), norm()),
     "next": lambda: norm(("next", "observation"), ("next", "observation")),
-    "renamed": lambda: Compose(norm("observation", "raw"), RenameTransform(in_keys=["raw"], out_keys=["observation"])),
+    "renamed": lambda: Compose(norm("observation", "raw"), o.RenameTransform(["raw"], ["observation"])),
 }
 
 
@@ -97,14 +86,15 @@ def test_transforms_that_change_the_observation_before_qaf_are_refused(name):
         message = "changes 'raw' before QAFTransform reads it"
     with pytest.raises(ValueError, match=message):
         Compose(BEFORE[name](), queries())
-    env = make_env()
-    if name != "next":
-        with pytest.raises(ValueError, match=message):
-            TransformedEnv(env, Compose(BEFORE[name](), queries()))
-        with pytest.raises(ValueError, match=message):
-            TransformedEnv(env, BEFORE[name]()).append_transform(queries())
-        with pytest.raises(ValueError, match=message):
-            TransformedEnv(TransformedEnv(env, BEFORE[name](), auto_unwrap=False), queries(), auto_unwrap=False)
+    env, around = make_env(), {"auto_unwrap": False}
+    for build in (
+        lambda: TransformedEnv(env, Compose(BEFORE[name](), queries())),
+        lambda: TransformedEnv(env, BEFORE[name]()).append_transform(queries()),
+        lambda: TransformedEnv(TransformedEnv(env, BEFORE[name](), **around), queries(), **around),
+    ):
+        if name != "next":
+            with pytest.raises(ValueError, match=message):
+                build()
     env.close()
 
 
@@ -123,16 +113,10 @@ def test_random_yaw_before_qaf_is_refused():
         TensorDictReplayBuffer(storage=LazyTensorStorage(6), transform=Compose(lw.RandomYaw(0.5), queries()))
 
 
-def test_queries_in_the_workers_may_be_followed_by_a_normaliser():
-    env = TransformedEnv(SerialEnv(2, lambda: TransformedEnv(make_env(), Compose(queries(), norm()))), StepCounter())
-    assert env.reset()["qaf"].shape[:2] == (2, 2)
-    env.close()
-
-
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_precision_observations_are_refused(dtype):
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(6), batch_size=6)
-    replay.append_transform(DTypeCastTransform(torch.float32, dtype))
+    replay.append_transform(o.DTypeCastTransform(torch.float32, dtype))
     replay.append_transform(queries())
     replay.extend(rows())
     with pytest.raises(ValueError, match="observation"):
@@ -142,7 +126,8 @@ def test_half_precision_observations_are_refused(dtype):
     assert queries()(precise)["qaf"].dtype == torch.bool
 
 
-def test_qaf_around_workers_that_have_not_started():
-    env = TransformedEnv(SerialEnv(2, make_env), queries())
-    assert env.reset()["qaf"].shape[:2] == (2, 2)
-    env.close()
+def test_qaf_in_workers_before_a_normaliser_and_around_workers_that_have_not_started():
+    inside = SerialEnv(2, lambda: TransformedEnv(make_env(), Compose(queries(), norm())))
+    for env in (TransformedEnv(inside, StepCounter()), TransformedEnv(SerialEnv(2, make_env), queries())):
+        assert env.reset()["qaf"].shape[:2] == (2, 2)
+        env.close()

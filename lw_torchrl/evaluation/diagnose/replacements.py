@@ -20,9 +20,9 @@ from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.tasks import TASKS, task_id
-from lw_torchrl.modules.attention import ACTIVE_WEIGHT
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.suites.metaworld.experts import ExpertActor
+from lw_torchrl.transforms.augmentation import ACTIVE_WEIGHT
 
 EpisodeId = tuple[str, int]  # task and episode index
 TRUE_OBSERVATION = "true_observation"  # the environment's observation, before any transform or module changes it
