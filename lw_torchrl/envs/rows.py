@@ -13,7 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from lw_torchrl._util.checks import Natural, check_value, shown
+from lw_torchrl._util.checks import check_value, shown
 from lw_torchrl._util.files import parse_json
 from lw_torchrl._util.reproducibility import episode_generator, episode_hash
 from lw_torchrl.language.layout import Layout
@@ -76,16 +76,12 @@ class EpisodeCounter:
     def requested(self, episode: int | Tensor, rows: Rows) -> Episodes:
         """Return the requested episodes of ``rows``; ``episode`` is an integer for all rows or an int64 tensor (N,)."""
         n = len(self.names)
-        if isinstance(episode, Tensor):
-            if episode.shape not in ((), (n,)) or episode.dtype not in (torch.int64, torch.int32):
-                got = f"{episode.dtype} of shape {tuple(episode.shape)}"
-                raise ValueError(f"episode must be an integer or an int64 tensor of shape ({n},), got {got}")
-        elif check_value("episode", episode, Natural) >= 2**63:
-            raise ValueError(f"episode must be below 2**63, got {shown(episode)}")
-        episodes = torch.as_tensor(episode).expand(n).cpu().numpy().astype(np.int64)[rows]
-        if (episodes < 0).any():
-            raise ValueError(f"episode must be at least 0, got {episodes.min()}")
-        return episodes
+        numbers = (
+            episode.cpu().numpy() if isinstance(episode, Tensor) else np.array(check_value("episode", episode, int))
+        )
+        if numbers.shape not in ((), (n,)) or numbers.dtype.kind != "i" or (numbers < 0).any():
+            raise ValueError(f"episode must be an int64, or int64 of shape ({n},), of at least 0, got {shown(episode)}")
+        return np.broadcast_to(numbers, n)[rows].astype(np.int64)
 
     def seeds(self, rows: Rows, episodes: Episodes) -> list[int]:
         return [
@@ -172,13 +168,13 @@ def _flag(n: int) -> Categorical:
     return Categorical(2, shape=(n, 1), dtype=torch.bool)
 
 
-def clipped_action(tensordict: TensorDictBase, shape: tuple[int, ...]) -> Tensor:
-    """Return the action, clipped to [-1, 1]; raise an error unless it is float32 of the expected shape."""
-    action = tensordict.get("action", None)
+def read_action(tensordict: TensorDictBase, size: int) -> Tensor:
+    """Return the ``action`` that an actor wrote; raise a ValueError unless the action is (*B, size) float32."""
+    action, shape = tensordict.get("action", None), (*tensordict.batch_size, size)
     if action is None or action.shape != shape or action.dtype != torch.float32:
-        got = "no action" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
+        got = f"{action.dtype} of shape {tuple(action.shape)}" if action is not None else "no action"
         raise ValueError(f"action must be float32 of shape {shape}, got {got}")
-    return action.detach().clamp(-1.0, 1.0)
+    return action
 
 
 class RowStates:

@@ -43,19 +43,13 @@ class Finding:
 
 @typed
 def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
-    """Run a few time steps of each task and compare the results with the suite's layout.
+    """Run a few time steps of two rows of each task, compare the results with the suite's layout, and return a
+    :class:`Finding` for each measurement, ordered by task.
 
-    The engine runs two rows of each task. The checks cover:
-
-    - the interface: types and shapes of the engine's results, the same episode for the same seed, no change in inactive
-      rows, and correct values of the previous time step;
-    - the hand: the direction of each displacement axis, the distance per time step (``reach``), and a prompt stop;
-    - the gripper: it opens and closes, and, if ``binary_gripper``, no slower than in Meta-World;
-    - the objects: they stay in place while the hand moves, and rest at a plausible height above the table;
-    - the success: not every episode succeeds while the hand rests.
-
-    Returns:
-        A :class:`Finding` for each measurement, ordered by task.
+    The checks cover the interface (types and shapes, seeds, inactive rows, values of the previous step), the hand
+    (direction of each axis, distance per time step, prompt stop), the gripper (it opens and closes, and, if
+    ``binary_gripper``, no slower than in Meta-World), the objects (they stay in place while the hand moves, and rest at
+    a plausible height above the table) and the success (not every episode succeeds while the hand rests).
 
     Example:
         >>> from lw_torchrl.suites import check_suite, load_suite
@@ -159,12 +153,8 @@ class _Bench:
             right = moved.argmax() == axis and abs(moved[axis] - layout.reach) < 0.35 * layout.reach
             wanted = f"{layout.reach * 100:.1f} cm along {name}"
             if axis == 2 and np.abs(moved).max() < 1e-3 * layout.reach:
-                yield (
-                    f"+{name} moves {_AXES[name]}",
-                    "nothing: the hand stays in a plane",
-                    f"{wanted}, or nothing",
-                    True,
-                )
+                nothing = "nothing: the hand stays in a plane"
+                yield f"+{name} moves {_AXES[name]}", nothing, f"{wanted}, or nothing", True
                 continue
             yield f"+{name} moves {_AXES[name]}", f"({measured}) cm a step", wanted, bool(right)
             for number, slot in enumerate(layout.things, 1):

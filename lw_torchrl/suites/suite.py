@@ -52,16 +52,15 @@ class Suite:
     def __post_init__(self) -> None:
         for relation in self.layout.thresholds:
             check_choice(f"thresholds of layout {self.layout.name!r}", relation, PREDICATES)
+        prefix = "" if self.name == "metaworld" else f"{self.name}/"
         for name, task in self.tasks.items():
-            if task.name != name:
-                raise ValueError(f"tasks of suite {self.name!r} must map names to tasks, got {task.name!r} as {name!r}")
-            if task.layout != self.layout:
-                raise ValueError(f"task {name!r} must have the layout of suite {self.name!r}, got {task.layout.name!r}")
-            if self.name != "metaworld" and not name.startswith(f"{self.name}/"):
-                raise ValueError(f"tasks of suite {self.name!r} must be named '{self.name}/...', got {name!r}")
+            if task.name != name or task.layout != self.layout or not name.startswith(prefix):
+                wanted = f"names '{prefix}...' to tasks with the layout {self.layout.name!r}"
+                raise ValueError(f"tasks must map {wanted}, got {name!r}: {task.name!r} with {task.layout.name!r}")
         if self.plans is not None and (other := set(self.plans) - set(self.tasks)):
-            unknown = ", ".join(sorted(other))
-            raise ValueError(f"plans of suite {self.name!r} must be for tasks in the suite, got plans for {unknown}")
+            raise ValueError(
+                f"plans of suite {self.name!r} must be for its tasks, got plans for {', '.join(sorted(other))}"
+            )
         if not isinstance(self.tasks, ReadOnlyDict):
             object.__setattr__(self, "tasks", ReadOnlyDict(dict(sorted(self.tasks.items()))))
 

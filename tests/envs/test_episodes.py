@@ -29,18 +29,16 @@ def plain_env(num_envs: int, max_steps: int = STEPS) -> lw.LanguageWorldEnv:
     return lw.LanguageWorldEnv(TASKS, num_envs=num_envs, seed=SEED, max_steps=max_steps, reward="dense")
 
 
+@cache
+def transformed_env(num_envs: int, max_steps: int = STEPS) -> TransformedEnv:
+    return TransformedEnv(plain_env.__wrapped__(num_envs, max_steps), lw.QAFTransform(lw.load_plans("MT10")))
+
+
 @pytest.fixture(scope="module", autouse=True)
 def close() -> Iterator[None]:
     yield
     plain_env.cache_clear()
     transformed_env.cache_clear()
-
-
-@cache
-def transformed_env(num_envs: int, max_steps: int = STEPS) -> TransformedEnv:
-    plans = lw.load_plans("MT10")
-    env = lw.LanguageWorldEnv(TASKS, num_envs=num_envs, seed=SEED, max_steps=max_steps, reward="dense")
-    return TransformedEnv(env, lw.QAFTransform(plans))
 
 
 def wavy(tensordict: TensorDictBase) -> TensorDictBase:
@@ -90,8 +88,6 @@ def same(left: TensorDictBase, right: TensorDictBase) -> bool:
     return keys == set(right.keys(True, True)) and all(torch.equal(left[key], right[key]) for key in keys)
 
 
-# ---- the requested episodes
-
 LISTS = st.lists(st.integers(0, 12), unique=True, max_size=5)
 
 
@@ -134,11 +130,8 @@ def test_episodes_of_different_lengths_keep_their_index(make):
         recorded = run(env, policy, episodes, keys=keys)
     assert recorded.keys() == pairs(episodes)
     for key, steps in recorded.items():
-        length = ending.get(key, STEPS)
-        assert steps.batch_size == (length,)
         assert steps["next", "fault"].any().item() == (key in ending)
-        expected = expected_steps(*key)[:length]
-        assert torch.equal(steps["observation"], expected["observation"])
+        assert torch.equal(steps["observation"], expected_steps(*key)["observation"][: ending.get(key, STEPS)])
 
 
 def test_the_policy_reads_the_mask_of_active_rows():
@@ -168,9 +161,6 @@ def test_an_abandoned_run_does_not_change_the_next_one():
     assert all(same(steps, expected_steps(*key)) for key, steps in recorded.items())
 
 
-# ---- any number of rows
-
-
 @pytest.mark.parametrize("make", [plain_env, transformed_env])
 def test_results_do_not_depend_on_the_number_of_rows(network, make):
     """Bit for bit, with a network in blocks, noise, and many steps."""
@@ -190,19 +180,13 @@ def test_blocks_give_the_policys_results(network):
     torch.manual_seed(1)
     states = TensorDict({"observation": torch.randn(200, 39), "row": torch.arange(200)}, [200])
     whole = in_blocks(network)(states.clone())
-    assert set(whole.keys()) == {"observation", "row", "action"}
+    assert (whole.exclude("action") == states).all()
     assert torch.allclose(whole["action"], network(states.clone())["action"], atol=1e-6)
     for size in (1, 2, 63, 64, 65, 128, 130, 199):
         part = in_blocks(network)(states[:size].clone())
-        assert part.batch_size == (size,)
-        assert torch.equal(part["action"], whole["action"][:size]), size
-        assert torch.equal(part["observation"], states["observation"][:size])
-        assert part["row"].tolist() == list(range(size))
+        assert (part == whole[:size]).all(), size
     order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
     assert torch.equal(in_blocks(network)(states[order].clone())["action"], whole["action"][order])
-
-
-# ---- noise
 
 
 @pytest.mark.parametrize("hold", [1, 3])
@@ -229,47 +213,25 @@ def test_noise_depends_only_on_the_episode(hold):
     assert all(same(steps.exclude("clean"), expected_steps(*key)) for key, steps in quiet.items())
 
 
-# ---- stopping early
-
-
 @pytest.mark.parametrize("after", first_fast([0, 7]))
 @pytest.mark.parametrize("make", [plain_env, transformed_env])
 def test_stopping_after_success_does_not_change_success(make, after):
-    length = 110
-    episodes = {"push": [3, 0, 8], "reach": [5, 2, 0, 7, 1]}
-    keys = ["observation", "action", ("next", "success")]
+    length, episodes = 110, {"push": [3, 0, 8], "reach": [5, 2, 0, 7, 1]}
+    keys, noise = ["observation", "action", ("next", "success")], lambda _: (0.2,) * 4
     progress: dict[int | None, list[int]] = {None: [], after: []}
-    runs = {
-        stop: run(
-            make(3, length),
-            lw.ExpertActor(TASKS),
-            episodes,
-            keys=keys,
-            noise=lambda _: (0.2,) * 4,
-            after_success=stop,
-            on_progress=progress[stop].append,
-        )
-        for stop in (None, after)
-    }
+    runs = {}
+    for stop, counts in progress.items():
+        options = {"keys": keys, "noise": noise, "after_success": stop, "on_progress": counts.append}
+        runs[stop] = run(make(3, length), lw.ExpertActor(TASKS), episodes, **options)
     assert runs[after].keys() == runs[None].keys() == pairs(episodes)
-    lengths = []
     for key, whole in runs[None].items():
         assert whole.batch_size == (length,)
-        success = whole["next", "success"].flatten()
-        short = runs[after][key]
-        lengths.append(len(short))
-        assert short["next", "success"].any() == success.any()
-        if success.any():
-            assert len(short) == min(int(success.nonzero()[0]) + 1 + after, length)
+        success, short = whole["next", "success"].flatten(), runs[after][key]
+        assert len(short) == (min(int(success.nonzero()[0]) + 1 + after, length) if success.any() else length)
         assert same(short, whole[: len(short)])
-    assert len(set(lengths)) > 3, "episodes of different lengths"
-    assert min(lengths) < length
-    total = len(pairs(episodes)) * length
-    assert sum(progress[after]) == sum(progress[None]) == total
+    assert len({len(steps) for steps in runs[after].values()}) > 3, "episodes of different lengths"
+    assert sum(progress[after]) == sum(progress[None]) == len(runs[None]) * length
     assert len(progress[after]) < len(progress[None])
-
-
-# ---- errors
 
 
 def test_a_module_may_ask_for_smaller_blocks():

@@ -34,21 +34,15 @@ def test_keys_shapes_and_types(env):
     env.set_seed(0)
     state = env.rand_step(env.reset())
     flags = {key: ((6, 1), torch.bool) for key in ("success", "fault", "done", "terminated", "truncated")}
-    expected = flags | {
-        "observation": ((6, 39), torch.float32),
-        "task_id": ((6,), torch.int64),
-        "episode": ((6,), torch.int64),
-        "executed_action": ((6, 4), torch.float32),
-    }
-    for key, (shape, dtype) in expected.items():
-        for part in (state, state["next"]):
-            assert (part[key].shape, part[key].dtype) == (shape, dtype), key
-    assert (state["next", "reward"].shape, state["next", "reward"].dtype) == ((6, 1), torch.float32)
-    assert (state["action"].shape, state["action"].dtype) == ((6, 4), torch.float32)
+    ids = {key: ((6,), torch.int64) for key in ("task_id", "episode")}
+    actions = {key: ((6, 4), torch.float32) for key in ("action", "executed_action")}
+    expected = flags | ids | actions | {"observation": ((6, 39), torch.float32), "reward": ((6, 1), torch.float32)}
+    for part, absent in ((state.exclude("next"), "reward"), (state["next"], "action")):
+        shapes = {key: (tuple(value.shape), value.dtype) for key, value in part.items()}
+        assert shapes == {key: value for key, value in expected.items() if key != absent}
     assert env.row_tasks == (*FEW, *FEW)
     assert state["task_id"].tolist() == [lw.task_id(task) for task in env.row_tasks]
-    assert env.action_spec.space.low.unique().tolist() == [-1.0]
-    assert env.action_spec.space.high.unique().tolist() == [1.0]
+    assert (env.action_spec.space.low.unique(), env.action_spec.space.high.unique()) == (-1.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -130,8 +124,7 @@ def test_eighty_steps_and_dense_rewards_equal_metaworlds(metaworld_env, scale, e
     env = lw.LanguageWorldEnv(tasks, seed=2, reward="dense", engine=engine)
     expert = lw.ExpertActor(tasks)
     state = env.reset()
-    owns = [metaworld_env(task) for task in tasks]
-    for own, task in zip(owns, tasks, strict=True):
+    for own, task in zip(owns := [metaworld_env(task) for task in tasks], tasks, strict=True):
         own.seed(episode_seed(task, 2, 0))
         own.reset()
     successes = 0

@@ -2,7 +2,6 @@
 
 import ctypes
 import os
-import re
 import signal
 import sys
 import threading
@@ -16,7 +15,8 @@ import mujoco
 import numpy as np
 import pytest
 from numba import njit
-from test_vectorized_engine import SHARING, TASKS, VARIED, differences, play, same_bits
+from numba.core.caching import CompileResultCacheImpl
+from test_vectorized_engine import SHARING, TASKS, VARIED, differences, memory, play, same_bits
 
 from lw_torchrl.suites.metaworld import row_kernel, simulated_rows
 from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel
@@ -44,10 +44,11 @@ def test_simulation_is_compiled_by_default():
 
 @pytest.mark.parametrize("tasks", [SHARING * 2 + VARIED, pytest.param(TASKS, marks=pytest.mark.slow)], ids=len)
 def test_masks_and_resets_have_the_bits_of_python_threads(tasks):
-    """Compare all results and the whole states, for one and two threads, in single and in double precision."""
+    """Compare all results and the whole states, for any number of threads, in single and in double precision."""
     n, rng = len(tasks), np.random.default_rng(2)
     python = python_engine(tasks, num_threads=1, reward="dense")
-    engines = [VectorizedEngine(tasks, num_threads=threads, reward="dense") for threads in (1, 2)]
+    engines = [VectorizedEngine(tasks, num_threads=threads, reward="dense") for threads in (1, 2, 8)]
+    engines.append(python_engine(tasks, num_threads=3, reward="dense"))
     for engine in (python, *engines):
         engine.reset(range(n), range(n))
     for step in range(30):
@@ -128,18 +129,8 @@ def test_error_of_mujoco_is_a_fault_until_the_reset(make, threads):
         assert not differences(twin.step(action, everyone), engine.step(action, everyone))
 
 
-def broken(row: int, field: str, value: float):
-    def damage(engine: VectorizedEngine) -> None:
-        getattr(engine._rows[row]._data, field)[:] = value
-
-    return damage
-
-
-FIELDS = ("qpos", "qvel", "qacc_warmstart", "qfrc_applied", "xfrc_applied", "mocap_quat")
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e12, 1e300])
-@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("field", ["qpos", "qvel", "qacc_warmstart", "qfrc_applied", "xfrc_applied", "mocap_quat"])
 def test_extreme_states_have_the_results_of_python_threads(field, value):
     """None of these ends the process; what faults in Python threads faults in compiled code."""
     tasks = [*SHARING, *VARIED]
@@ -148,7 +139,7 @@ def test_extreme_states_have_the_results_of_python_threads(field, value):
     for engine in engines:
         engine.reset(range(n), range(n))
         for row in range(0, n, 2):
-            broken(row, field, value)(engine)
+            getattr(engine._rows[row]._data, field)[:] = value
     for step in range(3):
         results = [engine.step(np.full((n, 4), 0.1 * step), np.ones(n, bool)) for engine in engines]
         assert not differences(*results)
@@ -221,63 +212,30 @@ def test_rows_of_an_interrupted_step_must_be_reset(make):
     assert same_bits(play(engine, tasks, 3)[-1], expected).all()
 
 
-def reload_kernel(monkeypatch) -> None:
-    monkeypatch.delitem(sys.modules, "lw_torchrl.suites.metaworld.row_kernel")
-    monkeypatch.delattr("lw_torchrl.suites.metaworld.row_kernel")
-    find_row_kernel.cache_clear()
-
-
-def without_numba(monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "numba", None)
-
-
-def without_a_cache_folder(monkeypatch) -> None:
-    from numba.core.caching import CompileResultCacheImpl
-
-    monkeypatch.setattr(CompileResultCacheImpl, "_locator_classes", [])
-
-
-def without_compiler(monkeypatch) -> None:
-    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
-
-
-def with_numba_of_the_future(monkeypatch) -> None:
-    monkeypatch.delattr("numba.extending.intrinsic")
-
-
-def with_another_mujoco(monkeypatch) -> None:
-    monkeypatch.setattr(mujoco, "_functions", SimpleNamespace(__file__=None))
-
-
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (without_numba, "ModuleNotFoundError: import of numba halted"),
-        (without_a_cache_folder, "no locator available"),
-        (without_compiler, "NUMBA_DISABLE_JIT"),
-        (with_numba_of_the_future, "cannot import name 'intrinsic'"),
-        (with_another_mujoco, "AttributeError.*mj_step"),
+        (lambda patch: patch.setitem(sys.modules, "numba", None), "ModuleNotFoundError: import of numba halted"),
+        (lambda patch: patch.setattr(CompileResultCacheImpl, "_locator_classes", []), "no locator available"),
+        (lambda patch: patch.setenv("NUMBA_DISABLE_JIT", "1"), "NUMBA_DISABLE_JIT"),
+        (lambda patch: patch.delattr("numba.extending.intrinsic"), "cannot import name 'intrinsic'"),
+        (lambda patch: patch.setattr(mujoco, "_functions", SimpleNamespace(__file__=None)), "AttributeError.*mj_step"),
     ],
 )
 def test_engine_warns_once_and_simulates_in_python_threads(change, reason, monkeypatch):
     expected = play(VectorizedEngine(["reach"], num_threads=1), ["reach"], 3)[-1]
-    reload_kernel(monkeypatch)
+    monkeypatch.delitem(sys.modules, "lw_torchrl.suites.metaworld.row_kernel")
+    monkeypatch.delattr("lw_torchrl.suites.metaworld.row_kernel")
+    find_row_kernel.cache_clear()
     change(monkeypatch)
     try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with pytest.warns(UserWarning, match=f"Python threads.*{reason}.*NUMBA_CACHE_DIR") as caught:
             engines = [VectorizedEngine(["reach"], num_threads=1) for _ in range(2)]
         assert [engine._compiled for engine in engines] == [None, None]
-        (warning,) = caught
-        assert warning.category is UserWarning
-        assert re.search(f"Python threads.*{reason}.*NUMBA_CACHE_DIR", str(warning.message))
+        assert len(caught) == 1
         assert same_bits(play(engines[0], ["reach"], 3)[-1], expected).all()
     finally:
         find_row_kernel.cache_clear()
-
-
-def memory() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads /proc")
@@ -380,4 +338,4 @@ def test_closed_and_collected_pools_end_their_threads():
     del collected, pool
     for thread in threads:
         thread.join(10)
-        assert not thread.is_alive()
+    assert not any(thread.is_alive() for thread in threads)
