@@ -159,7 +159,8 @@ class LanguageWorldEnv(EnvBase):
         return seed if seed is None or static_seed else seed_generator(abs(seed))
 
     def _set_seed(self, seed: int | None) -> None:
-        self._counter.start_again(seed)
+        self._counter.seed = self._counter.seed if seed is None else seed
+        self._counter.resets[:] = 0
 
     @property
     def task_of_row(self) -> tuple[Task, ...]:

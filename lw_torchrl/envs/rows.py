@@ -64,12 +64,6 @@ class EpisodeCounter:
         self._rank, copies = rows // n, np.bincount(rows % n)[rows % n]
         self._first, self._stride = worker[0] * copies + self._rank, worker[1] * copies
 
-    def start_again(self, seed: int | None) -> None:
-        """Restart at the first episode, with a new seed unless ``seed`` is None."""
-        if seed is not None:
-            self.seed = seed
-        self.resets[:] = 0
-
     def next(self, rows: Rows) -> Episodes:
         return (self.resets * self._stride + self._first)[rows]
 
@@ -84,9 +78,8 @@ class EpisodeCounter:
         return np.broadcast_to(numbers, n)[rows].astype(np.int64)
 
     def seeds(self, rows: Rows, episodes: Episodes) -> list[int]:
-        return [
-            episode_seed(self.tasks[row], self.seed, int(episode)) for row, episode in zip(rows, episodes, strict=True)
-        ]
+        pairs = zip(rows, episodes, strict=True)
+        return [episode_seed(self.tasks[row], self.seed, int(episode)) for row, episode in pairs]
 
     def dump(self) -> Tensor:
         """Return tasks, seed and counters as a tensor of JSON bytes (n,) uint8."""
@@ -115,8 +108,7 @@ def _with_ids(method: Callable[..., Any], change: Callable[..., Tensor] = lambda
 
 class TaskIds(Categorical):
     """The spec of ``task_id`` (N,) int64. Its ``zero()`` returns each row's own task id, because TorchRL calls policies
-    on the zeros of ``fake_tensordict()``, and a policy may not know the task with id 0.
-    """
+    on the zeros of ``fake_tensordict()``, and a policy may not know the task with id 0."""
 
     ids: Tensor | None = None
 
@@ -209,10 +201,9 @@ class RowStates:
 
         ``executed_action`` is (N, A) float32; None writes zeros.
         """
-        n = len(self.tasks)
         over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
-        if executed_action is None:
-            executed_action = np.zeros((n, self.layout.action_size), dtype=np.float32)
+        n, size = len(self.tasks), self.layout.action_size
+        executed = torch.zeros(n, size) if executed_action is None else torch.from_numpy(executed_action)
         return TensorDict(
             {
                 "observation": torch.from_numpy(self.observation.copy()),
@@ -220,12 +211,12 @@ class RowStates:
                 "episode": torch.from_numpy(self.episode.copy()),
                 "success": success,
                 "fault": fault,
-                "executed_action": torch.from_numpy(executed_action),
+                "executed_action": executed,
                 "done": over,
                 "terminated": terminated,
                 "truncated": over & ~terminated,
                 **more,
             },
             batch_size=(n,),
-            device=torch.device("cpu"),
+            device="cpu",
         )

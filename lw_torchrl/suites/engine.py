@@ -27,8 +27,7 @@ class EngineStep(NamedTuple):
 class Engine(Protocol):
     """A simulator of N parallel environments, called rows. To support camera images, an engine also implements
     ``render`` as in :class:`~lw_torchrl.suites.cameras.SeenRows`; to support recordings of the scene, ``row_model`` and
-    ``poses``.
-    """
+    ``poses``."""
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start an episode in each of ``rows`` and return the first observations (len(rows), D) float64. The initial

@@ -67,8 +67,7 @@ class Suite:
     def named_tasks(self, tasks: TaskList, own: Tasks | None = None) -> dict[str, Task]:
         """Return a dict from full task name to task, sorted by name. ``tasks`` is the suite's name (for all tasks), a
         task's name with or without the suite's prefix, a :class:`Task`, or a list of these; names are also looked up
-        in ``own``.
-        """
+        in ``own``."""
         known = {**self.tasks, **own} if own else self.tasks
         if tasks == self.name:
             return dict(self.tasks)
@@ -116,8 +115,7 @@ def load_suite(suite: str | Suite) -> Suite:
 
 def suite_name(task: str) -> str:
     """Return the name of a task's suite: the prefix of the task's name, or "metaworld" for a name without a prefix. The
-    name of a suite is returned unchanged.
-    """
+    name of a suite is returned unchanged."""
     # SUITES reads the entry points of all installed packages, which is slow, so check known names first.
     is_metaworld = task in (*TASKS, "MT10", "MT50")
     return task.partition("/")[0] if "/" in task or (not is_metaworld and task in SUITES) else "metaworld"

@@ -9,7 +9,7 @@ from contextlib import redirect_stderr
 from functools import cache
 from importlib import import_module
 from io import StringIO
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -70,37 +70,27 @@ _METRES = 0.05  # metres per unit of displacement
 _SUCCESS = 0.05  # maximum distance to the goal at success, metres
 
 
-class _Scene(NamedTuple):
-    """A task's class in gymnasium-robotics, and the origin of Meta-World's axes in Fetch's axes (metres).
-
-    With this origin, an object on the table has z = 0.018, 2 mm below the threshold of "touching the table", and the
-    hand starts near x = 0, y = 0.6.
-    """
-
-    module: str
-    env: str
-    origin: tuple[float, float, float]
-
-
+# Each task's module and class in gymnasium-robotics, and the origin of Meta-World's axes in Fetch's axes (metres). With
+# this origin, an object on the table has z = 0.018, 2 mm below the threshold of "touching the table", and the hand
+# starts near x = 0, y = 0.6.
 _SCENES = {
-    "fetch/reach": _Scene("reach", "MujocoFetchReachEnv", (0.745, 0.75, 0.40675)),
-    "fetch/push": _Scene("push", "MujocoFetchPushEnv", (0.745, 0.75, 0.40675)),
-    "fetch/slide": _Scene("slide", "MujocoFetchSlideEnv", (0.395, 0.75, 0.3955)),
-    "fetch/pick-and-place": _Scene("pick_and_place", "MujocoFetchPickAndPlaceEnv", (0.745, 0.75, 0.40675)),
+    "fetch/reach": ("reach", "MujocoFetchReachEnv", (0.745, 0.75, 0.40675)),
+    "fetch/push": ("push", "MujocoFetchPushEnv", (0.745, 0.75, 0.40675)),
+    "fetch/slide": ("slide", "MujocoFetchSlideEnv", (0.395, 0.75, 0.3955)),
+    "fetch/pick-and-place": ("pick_and_place", "MujocoFetchPickAndPlaceEnv", (0.745, 0.75, 0.40675)),
 }
 
 
 @cache
 def _builder(task: str) -> Any:
-    """Build the gymnasium-robotics environment of a task. All rows of all engines share the environment's model, which
-    never changes."""
-    scene = _SCENES[task]
+    """Build a task's gymnasium-robotics environment, whose model never changes and is shared by all rows."""
+    scene, env, _ = _SCENES[task]
     with naming_absent_renderer(), redirect_stderr(StringIO()):  # the import prints messages about other environments
         try:
-            module = import_module(f"gymnasium_robotics.envs.fetch.{scene.module}")
+            module = import_module(f"gymnasium_robotics.envs.fetch.{scene}")
         except ImportError as error:
             raise ImportError("the Fetch suite needs the extra [fetch]: pip install 'lw_torchrl[fetch]'") from error
-    return getattr(module, scene.env)()
+    return getattr(module, env)()
 
 
 class _Row:
@@ -124,8 +114,7 @@ class _Row:
         # The joints that actuators drive; controls are relative to the joint positions. Two tasks have no actuators.
         driven = [data.qpos[joint : joint + 1] for joint in self._model.jnt_qposadr[self._model.actuator_trnid[:, 0]]]
         self._target = self._model.site("target0").id
-        # Zeros, from which values are read that the task does not have.
-        none = np.zeros(_DRIVEN.stop)
+        none = np.zeros(_DRIVEN.stop)  # values that the task does not have
         grip = data.site_xpos[self._model.site("robot0:grip").id]
         objects = [none[_OBJECT], none[_QUATERNION]]
         driven = driven or [none[_DRIVEN]]
@@ -203,7 +192,7 @@ class FetchEngine(ThreadedEngine):
         n = len(tasks)
         super().__init__([""] * n, FETCH, num_threads)  # models are read-only, so rows need not be grouped by model
         self._rows = [_Row(task) for task in tasks]
-        self._origin = np.array([_SCENES[task].origin for task in tasks]).reshape(n, 3)
+        self._origin = np.array([_SCENES[task][2] for task in tasks]).reshape(n, 3)
         self._has_object = np.array([row.has_object for row in self._rows], dtype=bool)
         self._read = np.zeros((n, _DRIVEN.stop))
         self._compile()

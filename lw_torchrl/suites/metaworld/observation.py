@@ -60,8 +60,7 @@ class StateView:
 
     def find(self, what: str) -> Index:
         """Return the indices in ``numbers`` of a named quantity: the position (3) of "body NAME", "geom NAME" or "site
-        NAME"; "matrix of geom NAME" (9), or of a body or site; "quaternion of body NAME" (4); or "joint NAME" (1).
-        """
+        NAME"; "matrix of geom NAME" (9), or of a body or site; "quaternion of body NAME" (4); or "joint NAME" (1)."""
         kind, _, name = what.rpartition(" ")
         array = self._arrays[kind]
         named = getattr(self._model, kind.split()[-1])(name)
@@ -138,15 +137,13 @@ class Observer:
 
 def row_norm(vectors: Array) -> Array:
     """Return the Euclidean norm of each row, bit-identical to calling ``np.linalg.norm`` on that row. Both use the BLAS
-    dot product; summing squares over an axis would round differently for one row in nine.
-    """
+    dot product; summing squares over an axis would round differently for one row in nine."""
     return np.sqrt(np.vecdot(vectors, vectors))
 
 
 def quaternion_of_matrix(matrix: Any) -> tuple[float, float, float, float]:
     """Convert a rotation matrix, nine numbers, to a quaternion in x, y, z, w order. The result is bit-identical to
-    SciPy's ``Rotation.from_matrix(...).as_quat()``, which is much slower. The kernel compiles this function.
-    """
+    SciPy's ``Rotation.from_matrix(...).as_quat()``, which is much slower. The kernel compiles this function."""
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix
     trace = m00 + m11 + m22
     # SciPy first computes the largest component, then the other components from it, which loses fewer digits.
@@ -165,8 +162,7 @@ def quaternion_of_matrix(matrix: Any) -> tuple[float, float, float, float]:
 
 class Scene(NamedTuple):
     """The inputs of a success rule: whether each row's point is near the goal (rows,), observed sensors (rows, WIDTH),
-    goals (rows, 3), and points (rows, 3) that must reach the goals.
-    """
+    goals (rows, 3), and points (rows, 3) that must reach the goals."""
 
     near: Mask
     sensors: Array
@@ -181,8 +177,7 @@ STICK_UPWARD = 0.06
 
 class SuccessFunction:
     """A callable that computes the success of a fixed set of rows. ``programs`` maps a row to its current
-    :class:`TaskProgram`, for the one rule that reads contacts.
-    """
+    :class:`TaskProgram`, for the one rule that reads contacts."""
 
     def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:
         success = [row.success for row in sources]

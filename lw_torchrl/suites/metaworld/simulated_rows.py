@@ -336,7 +336,6 @@ class ThreadedEngine(SeenRows):
         return BodyPoses(position.copy(), quaternion.copy())
 
     def close(self) -> None:
-        """Stop the threads and free the simulations."""
         super().close()
         self._pool.close()
         self._compiled = None

@@ -187,9 +187,10 @@ def test_rows_need_little_memory_and_models_are_reused():
     engine.step(np.zeros((80, 4)), np.ones(80, bool))
     assert (memory() - before) / 80 < 1.2e6
     assert time.perf_counter() - start < 5.0, "80 rows take about 0.6 s; 80 compiled models would take 10 s"
-    models, second = ({id(row.shared) for row in k._rows} for k in (engine, VectorizedEngine(tasks, num_threads=1)))
-    assert len(models) == len(second) == 2
-    assert not models & second, "engines that are open share no model"
+    second = VectorizedEngine(tasks, num_threads=1)
+    models, others = ({id(row.shared) for row in k._rows} for k in (engine, second))
+    assert len(models) == len(others) == 2
+    assert not models & others, "engines that are open share no model"
     engine.close()
     again = VectorizedEngine(tasks, num_threads=1)
     assert {id(row.shared) for row in again._rows} == models
