@@ -318,8 +318,8 @@ def test_file_written_on_the_device_is_loaded_on_the_cpu(demos, tmp_path):
     trainer = make_trainer(demos, "pretend", checkpoint=tmp_path / "c.safetensors")
     trainer.train()
     lw.save_actor(trainer.actor, tmp_path / "p.safetensors")
-    for path in tmp_path.glob("*.safetensors"):
-        loaded = lw.load_actor(path)
+    for name in ("c.safetensors", "p.safetensors"):
+        loaded = lw.load_actor(tmp_path / name)
         assert {tensor.device.type for tensor in loaded.state_dict().values()} == {"cpu"}
         assert_same(dict(loaded.named_parameters()), weights(trainer))
 
@@ -357,29 +357,23 @@ def make_state(rows=3):
 @pytest.mark.parametrize(
     ("key", "value", "problem"),
     [
-        ("observation", float("nan"), "observation must hold finite numbers"),
-        ("task_id", -1, "task_id contains tasks without a plan"),
+        ("observation", float("nan"), "observation must hold"),
+        ("task_id", -1, "task_id contains tasks"),
         ("qaf_plan", 5, "qaf was computed with plans"),
         ("qaf", 2.0, "qaf must be bool, or numbers from 0 to 1"),
     ],
 )
 def test_wrong_values_raise_without_waiting(key, value, problem):
-    actor = ACTORS["plan"]().to(PRETEND)
-    actor(make_state())
     state = make_state()
     if key == "qaf":
         state["qaf"] = state["qaf"].float()
     state[key].fill_(value)
-    WAITS.clear()
-    with pytest.raises(RuntimeError, match=problem):
-        actor(state)
-    assert WAITS == []
-    if key in ("observation", "task_id"):
-        queries = lw.QAFTransform(PLANS)
-        queries(make_state())
+    readers = [ACTORS["plan"]().to(PRETEND), *([] if "qaf" in key else [lw.QAFTransform(PLANS)])]
+    for reader in readers:
+        reader(make_state())
         WAITS.clear()
-        with pytest.raises(RuntimeError, match=problem.rsplit(" ", 2)[0]):
-            queries(state)
+        with pytest.raises(RuntimeError, match=problem):
+            reader(state)
         assert WAITS == []
 
 

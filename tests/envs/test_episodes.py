@@ -82,12 +82,6 @@ def pairs(episodes: dict[str, list[int]]) -> set[tuple[str, int]]:
     return {(task, episode) for task, listed in episodes.items() for episode in listed}
 
 
-def same(left: TensorDictBase, right: TensorDictBase) -> bool:
-    """Return whether two recordings have the same keys and agree in every bit."""
-    keys = set(left.keys(True, True))
-    return keys == set(right.keys(True, True)) and all(torch.equal(left[key], right[key]) for key in keys)
-
-
 LISTS = st.lists(st.integers(0, 12), unique=True, max_size=5)
 
 
@@ -103,7 +97,7 @@ def test_each_listed_episode_comes_once_and_is_reproducible(episodes, num_envs, 
     assert recorded.keys() == pairs(episodes)
     for (task, episode), steps in recorded.items():
         assert steps.batch_size == (STEPS,)
-        assert same(steps, expected_steps(task, episode)), (task, episode)
+        assert (steps == expected_steps(task, episode)).all(), (task, episode)
         assert steps["task_id"].unique().tolist() == [lw.task_id(task)]
         assert steps["episode"].unique().tolist() == [episode]
 
@@ -146,7 +140,7 @@ def test_the_policy_reads_the_mask_of_active_rows():
 
     recorded = run(plain_env(5), policy, {"push": [3], "reach": [0, 1, 2]})
     assert recorded.keys() == {("push", 3), ("reach", 0), ("reach", 1), ("reach", 2)}
-    assert all(same(steps, expected_steps(*key)) for key, steps in recorded.items())
+    assert all((steps == expected_steps(*key)).all() for key, steps in recorded.items())
     assert len(masks) == 2 * STEPS, "three episodes on two rows"
     assert [mask.sum().item() for mask in masks] == [3] * STEPS + [1] * STEPS
 
@@ -158,7 +152,7 @@ def test_an_abandoned_run_does_not_change_the_next_one():
         next(episodes)
         episodes.close()
     recorded = run(env, wavy, {"push": [1], "reach": [2]})
-    assert all(same(steps, expected_steps(*key)) for key, steps in recorded.items())
+    assert all((steps == expected_steps(*key)).all() for key, steps in recorded.items())
 
 
 @pytest.mark.parametrize("make", [plain_env, transformed_env])
@@ -171,9 +165,9 @@ def test_results_do_not_depend_on_the_number_of_rows(network, make):
     assert runs[0].keys() == pairs(episodes)
     for other in runs[1:]:
         assert other.keys() == runs[0].keys()
-        assert all(same(runs[0][key], other[key]) for key in other)
+        assert all((runs[0][key] == other[key]).all() for key in other)
     again = run(make(5, 60), in_blocks(network), {"reach": [5]}, **options)
-    assert same(again["reach", 5], runs[0]["reach", 5]), "other episodes must not matter either"
+    assert (again["reach", 5] == runs[0]["reach", 5]).all(), "other episodes must not matter either"
 
 
 def test_blocks_give_the_policys_results(network):
@@ -210,7 +204,7 @@ def test_noise_depends_only_on_the_episode(hold):
     assert clipped > 0
     quiet = run(plain_env(3), wavy, episodes, clean_action="clean", keys=keys)
     assert all(torch.equal(steps["action"], steps["clean"]) for steps in quiet.values())
-    assert all(same(steps.exclude("clean"), expected_steps(*key)) for key, steps in quiet.items())
+    assert all((steps.exclude("clean") == expected_steps(*key)).all() for key, steps in quiet.items())
 
 
 @pytest.mark.parametrize("after", first_fast([0, 7]))
@@ -228,7 +222,7 @@ def test_stopping_after_success_does_not_change_success(make, after):
         assert whole.batch_size == (length,)
         success, short = whole["next", "success"].flatten(), runs[after][key]
         assert len(short) == (min(int(success.nonzero()[0]) + 1 + after, length) if success.any() else length)
-        assert same(short, whole[: len(short)])
+        assert (short == whole[: len(short)]).all()
     assert len({len(steps) for steps in runs[after].values()}) > 3, "episodes of different lengths"
     assert sum(progress[after]) == sum(progress[None]) == len(runs[None]) * length
     assert len(progress[after]) < len(progress[None])

@@ -32,28 +32,25 @@ OPEN = 0.1
 
 
 def our_positions(positions: Array, origin: Array) -> Array:
-    """Convert positions (..., 3) float64 from Fetch's to Meta-World's axes. ``origin`` (..., 3) is the origin of
-    Meta-World's axes in Fetch's axes."""
+    """Convert positions (..., 3) from Fetch's to Meta-World's axes, whose ``origin`` (..., 3) is in Fetch's axes."""
     offset = positions - origin
     return np.stack((-offset[..., 1], offset[..., 0], offset[..., 2]), -1)
 
 
 def our_quaternions(quaternions: Array) -> Array:
-    """Convert rotations, quaternions (..., 4) float64 in w, x, y, z order, from Fetch's to Meta-World's axes. The
-    identity stays the identity."""
+    """Convert rotations (..., 4) in w, x, y, z order from Fetch's to Meta-World's axes; the identity stays the same."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     return np.stack((w, -y, x, z), -1)
 
 
 def turned_quaternions(quaternions: Array) -> Array:
-    """Convert body orientations (..., 4) float64, in w, x, y, z order, from Fetch's to Meta-World's axes."""
+    """Convert body orientations (..., 4) in w, x, y, z order from Fetch's to Meta-World's axes."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     return np.sqrt(0.5) * np.stack((w - z, x - y, x + y, w + z), -1)
 
 
 def fetch_actions(action: NDArray[Any]) -> NDArray[Any]:
-    """Convert actions (..., 4) in Meta-World's axes, where +1 closes the gripper, to gymnasium-robotics actions of the
-    same dtype, where +1 opens the gripper."""
+    """Convert actions (..., 4) from Meta-World's axes, where +1 closes the gripper, to Fetch's, where +1 opens it."""
     return np.stack((action[..., 1], -action[..., 0], action[..., 2], -action[..., 3]), -1)
 
 
@@ -130,8 +127,8 @@ class _Row:
         np.concatenate(self._sources, out=read)
 
     def simulate(self, inputs: Array, outputs: Array) -> bool:
-        """Write the inputs (mocap position and quaternion, controls), simulate 20 physics steps, and fill the outputs
-        (21,) with the new state. Return whether the simulation is stable."""
+        """Write the inputs (mocap position and quaternion, controls), simulate 20 physics steps, fill the outputs (21,)
+        with the new state, and return whether the simulation is stable."""
         data = self.data
         self._mocap[0][:], self._mocap[1][:] = inputs[:3], inputs[3:7]
         data.ctrl[:] = inputs[7 : 7 + len(data.ctrl)]

@@ -15,8 +15,8 @@ from lw_torchrl.suites.metaworld.reward_terms import Numbers, hamacher_product, 
 from lw_torchrl.suites.metaworld.tables import FIRST_DISTANCE, TaskReward
 
 Cast = Callable[[Any], Any]
-"""Type of a function that converts numbers to the precision of a formula. The precision is single if the reward depends
-on a float32 action, because NumPy keeps single precision when Python numbers are added."""
+"""A function that converts numbers to the precision of a formula: single if the reward depends on a float32 action,
+because NumPy keeps single precision when Python numbers are added."""
 
 Formula = Callable[["StepState", Index, Cast], Numbers]  # (state, rows, cast) -> rewards (len(rows),)
 

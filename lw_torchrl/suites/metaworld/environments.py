@@ -100,11 +100,9 @@ Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class SharedModel:
-    """A compiled model that many rows use in turn.
-
-    Meta-World's resets change the positions of bodies and sites in the model itself. So each row stores its own
-    positions, and loads them before it uses the model, unless it was the last row to do so (the ``holder``).
-    """
+    """A compiled model that many rows use in turn. Meta-World's resets change the positions of bodies and sites in the
+    model itself, so each row stores its own positions, and loads them before it uses the model, unless it was the last
+    row to do so (the ``holder``)."""
 
     def __init__(self, path: str, model: Any, compiled: Places | None = None) -> None:
         self.path, self.model = path, model

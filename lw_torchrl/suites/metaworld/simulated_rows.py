@@ -240,10 +240,8 @@ def _stop(call: list[Callable[[], object] | None], wakes: Sequence[threading.Loc
 
 
 class ThreadedEngine(SeenRows):
-    """Base class for engines that simulate physics in parallel threads (one per core by default).
-
-    Rows with the same key share a MuJoCo model.
-    """
+    """Base class for engines that simulate physics in parallel threads (one per core by default); rows with the same
+    key share a MuJoCo model."""
 
     _rows: list[Any]  # each has ``seen`` and ``bodies``
 
@@ -263,10 +261,7 @@ class ThreadedEngine(SeenRows):
 
     def _simulate(self, rows: Index, inputs: Array, outputs: Array) -> Mask:
         """Simulate rows with inputs (rows, K), fill outputs (rows, W), and return a bool mask (rows,) of the stable
-        rows.
-
-        Without the kernel, Python threads compute bit-identical results, but make ten slow Python calls per row.
-        """
+        rows. Without the kernel, Python threads compute the same bits, but make ten slow Python calls per row."""
         if self._compiled is not None:
             return self._compiled.simulate(rows, inputs, outputs, self._pool.run)
         stable = np.zeros(len(rows), dtype=bool)

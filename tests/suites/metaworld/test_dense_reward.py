@@ -2,7 +2,6 @@
 
 import warnings
 from collections import defaultdict
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from metaworld.utils import reward_utils
 
 from lw_torchrl.suites.metaworld import observation as at
 from lw_torchrl.suites.metaworld import reward_terms as terms
-from lw_torchrl.suites.metaworld.dense_reward import FORMULAS, LIFTS, DenseReward, EpisodeStarts
+from lw_torchrl.suites.metaworld.dense_reward import FORMULAS, LIFTS, DenseReward
 from lw_torchrl.suites.metaworld.environments import MetaWorldEngine
 from lw_torchrl.suites.metaworld.observation import Observer, StateView
 from lw_torchrl.suites.metaworld.simulated_rows import SimulatedRow
@@ -224,9 +223,3 @@ def test_table_has_a_reward_for_every_task_and_uses_every_formula():
     assert list(table) == TASKS
     assert {reward.formula for reward in table.values()} == set(FORMULAS)
     assert {reward.lift for reward in table.values()} - {None} == set(LIFTS)
-
-
-def test_missing_attribute_of_metaworld_raises():
-    starts = EpisodeStarts([reward_table()["window-open"]])
-    with pytest.raises(AttributeError, match="window_handle_pos_init"):
-        starts.begin(0, SimpleNamespace(obj_init_pos=np.zeros(3), init_tcp=np.zeros(3)))
