@@ -33,8 +33,9 @@ from lw_torchrl._util.workers import Episodes, spread
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour, SegmentActor, behaviour_of, segment_plans
 from lw_torchrl.data.dataset import COLUMNS, TRAJECTORY, CollectConfig, DatasetError, Demonstrations
-from lw_torchrl.envs.episodes import num_rows, policy_of, read_action, run_episodes
+from lw_torchrl.envs.episodes import num_rows, policy_of, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.envs.rows import read_action
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import plans_of, tasks_of, transform_of

@@ -34,9 +34,7 @@ class FinishedEpisode(NamedTuple):
 
     @property
     def first_success(self) -> int | None:
-        """The first successful time step, counted from 1; None if the episode never succeeds. Requires ("next",
-        "success") in ``steps``.
-        """
+        """The first successful time step, counted from 1, or None; ``steps`` must have ("next", "success")."""
         return first_success(self.steps.get(("next", "success")))
 
 
@@ -55,18 +53,6 @@ def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[
     if actor_device == CPU:
         return policy
     return lambda tensordict: tensordict.update(policy(tensordict.to(actor_device)).to(CPU))
-
-
-def read_action(tensordict: TensorDictBase, size: int) -> Tensor:
-    """Return the ``action`` that an actor wrote; raise a ValueError unless the action is (N, size) float32."""
-    action, shape = tensordict.get("action", None), (*tensordict.batch_size, size)
-    if action is None:
-        raise ValueError(f"the actor must write 'action', got {', '.join(map(str, tensordict.keys()))}")
-    if action.shape != shape or action.dtype != torch.float32:
-        raise ValueError(
-            f"the actor's action must be float32 of shape {shape}, got {action.dtype} of shape {tuple(action.shape)}"
-        )
-    return action
 
 
 def run_episodes(
@@ -108,8 +94,7 @@ def run_episodes(
     waiting = {task: deque(enumerate(listed)) for task, listed in episodes.items()}
     if unknown := set(waiting) - set(base.tasks):
         raise ValueError(f"episodes: env lacks the tasks {', '.join(sorted(unknown))}")
-    episode = torch.zeros(rows, dtype=torch.int64)
-    listed_at = torch.zeros(rows, dtype=torch.int64)
+    episode, listed_at = torch.zeros(2, rows, dtype=torch.int64)
     active = torch.zeros(rows, dtype=torch.bool)
     steps = np.zeros(rows, dtype=np.int64)
     last = np.zeros(rows, dtype=np.int64)  # the time step after which an episode ends early

@@ -21,7 +21,7 @@ from lw_torchrl._util.checks import Count, Natural, check_value, typed
 from lw_torchrl._util.devices import CPU, check_device, copied_at_once
 from lw_torchrl._util.keys import row_mask
 from lw_torchrl._util.rendering import check_picture
-from lw_torchrl.envs.rows import EpisodeCounter, RowStates, action_spec, clipped_action, done_spec, observation_spec
+from lw_torchrl.envs.rows import EpisodeCounter, RowStates, action_spec, done_spec, observation_spec, read_action
 from lw_torchrl.language.tasks import Task, one_layout
 from lw_torchrl.suites.engine import Engine
 from lw_torchrl.suites.metaworld import make_engine
@@ -159,7 +159,8 @@ class LanguageWorldEnv(EnvBase):
         return seed if seed is None or static_seed else seed_generator(abs(seed))
 
     def _set_seed(self, seed: int | None) -> None:
-        self._counter.start_again(seed)
+        self._counter.seed = self._counter.seed if seed is None else seed
+        self._counter.resets[:] = 0
 
     @property
     def task_of_row(self) -> tuple[Task, ...]:
@@ -188,10 +189,7 @@ class LanguageWorldEnv(EnvBase):
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Restore the seed and episode counters saved by an environment with the same rows; call ``reset`` next."""
         if strict and not state_dict:
-            raise ValueError(
-                "state_dict is empty: a Collector saves the state of an environment only in a TransformedEnv with a "
-                "QAFTransform, or in a SerialEnv or ParallelEnv; use strict=False to begin at episode 0"
-            )
+            raise ValueError("state_dict is empty: save it with a QAFTransform, or use strict=False for episode 0")
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def __getstate__(self) -> NoReturn:
@@ -200,10 +198,7 @@ class LanguageWorldEnv(EnvBase):
     def _check_process(self) -> None:
         # The simulator's threads and its OpenGL context do not survive a fork: a child process would hang.
         if os.getpid() != self._process:
-            raise RuntimeError(
-                "this process was forked after the environment was made: make the environment in this process (pass "
-                "ParallelEnv or the collector a function that makes the environment)"
-            )
+            raise RuntimeError("this process was forked after the environment was made; pass a function that makes it")
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None) -> TensorDict:
         self._check_process()
@@ -222,7 +217,7 @@ class LanguageWorldEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._check_process()
         size = self.layout.action_size
-        action = clipped_action(tensordict, (*self.batch_size, size)).cpu().numpy().reshape(-1, size)
+        action = read_action(tensordict, size).detach().clamp(-1.0, 1.0).cpu().numpy().reshape(-1, size)
         active = row_mask(tensordict, "_step", len(self.row_tasks))
         if (active & self._rows.over).any():
             rows = np.flatnonzero(active & self._rows.over)[:5].tolist()

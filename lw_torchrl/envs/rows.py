@@ -13,7 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from lw_torchrl._util.checks import Natural, check_value, shown
+from lw_torchrl._util.checks import check_value, shown
 from lw_torchrl._util.files import parse_json
 from lw_torchrl._util.reproducibility import episode_generator, episode_hash
 from lw_torchrl.language.layout import Layout
@@ -64,33 +64,22 @@ class EpisodeCounter:
         self._rank, copies = rows // n, np.bincount(rows % n)[rows % n]
         self._first, self._stride = worker[0] * copies + self._rank, worker[1] * copies
 
-    def start_again(self, seed: int | None) -> None:
-        """Restart at the first episode, with a new seed unless ``seed`` is None."""
-        if seed is not None:
-            self.seed = seed
-        self.resets[:] = 0
-
     def next(self, rows: Rows) -> Episodes:
         return (self.resets * self._stride + self._first)[rows]
 
     def requested(self, episode: int | Tensor, rows: Rows) -> Episodes:
         """Return the requested episodes of ``rows``; ``episode`` is an integer for all rows or an int64 tensor (N,)."""
         n = len(self.names)
-        if isinstance(episode, Tensor):
-            if episode.shape not in ((), (n,)) or episode.dtype not in (torch.int64, torch.int32):
-                got = f"{episode.dtype} of shape {tuple(episode.shape)}"
-                raise ValueError(f"episode must be an integer or an int64 tensor of shape ({n},), got {got}")
-        elif check_value("episode", episode, Natural) >= 2**63:
-            raise ValueError(f"episode must be below 2**63, got {shown(episode)}")
-        episodes = torch.as_tensor(episode).expand(n).cpu().numpy().astype(np.int64)[rows]
-        if (episodes < 0).any():
-            raise ValueError(f"episode must be at least 0, got {episodes.min()}")
-        return episodes
+        numbers = (
+            episode.cpu().numpy() if isinstance(episode, Tensor) else np.array(check_value("episode", episode, int))
+        )
+        if numbers.shape not in ((), (n,)) or numbers.dtype.kind != "i" or (numbers < 0).any():
+            raise ValueError(f"episode must be an int64, or int64 of shape ({n},), of at least 0, got {shown(episode)}")
+        return np.broadcast_to(numbers, n)[rows].astype(np.int64)
 
     def seeds(self, rows: Rows, episodes: Episodes) -> list[int]:
-        return [
-            episode_seed(self.tasks[row], self.seed, int(episode)) for row, episode in zip(rows, episodes, strict=True)
-        ]
+        pairs = zip(rows, episodes, strict=True)
+        return [episode_seed(self.tasks[row], self.seed, int(episode)) for row, episode in pairs]
 
     def dump(self) -> Tensor:
         """Return tasks, seed and counters as a tensor of JSON bytes (n,) uint8."""
@@ -119,8 +108,7 @@ def _with_ids(method: Callable[..., Any], change: Callable[..., Tensor] = lambda
 
 class TaskIds(Categorical):
     """The spec of ``task_id`` (N,) int64. Its ``zero()`` returns each row's own task id, because TorchRL calls policies
-    on the zeros of ``fake_tensordict()``, and a policy may not know the task with id 0.
-    """
+    on the zeros of ``fake_tensordict()``, and a policy may not know the task with id 0."""
 
     ids: Tensor | None = None
 
@@ -172,13 +160,13 @@ def _flag(n: int) -> Categorical:
     return Categorical(2, shape=(n, 1), dtype=torch.bool)
 
 
-def clipped_action(tensordict: TensorDictBase, shape: tuple[int, ...]) -> Tensor:
-    """Return the action, clipped to [-1, 1]; raise an error unless it is float32 of the expected shape."""
-    action = tensordict.get("action", None)
+def read_action(tensordict: TensorDictBase, size: int) -> Tensor:
+    """Return the ``action`` that an actor wrote; raise a ValueError unless the action is (*B, size) float32."""
+    action, shape = tensordict.get("action", None), (*tensordict.batch_size, size)
     if action is None or action.shape != shape or action.dtype != torch.float32:
-        got = "no action" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
+        got = f"{action.dtype} of shape {tuple(action.shape)}" if action is not None else "no action"
         raise ValueError(f"action must be float32 of shape {shape}, got {got}")
-    return action.detach().clamp(-1.0, 1.0)
+    return action
 
 
 class RowStates:
@@ -213,10 +201,9 @@ class RowStates:
 
         ``executed_action`` is (N, A) float32; None writes zeros.
         """
-        n = len(self.tasks)
         over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
-        if executed_action is None:
-            executed_action = np.zeros((n, self.layout.action_size), dtype=np.float32)
+        n, size = len(self.tasks), self.layout.action_size
+        executed = torch.zeros(n, size) if executed_action is None else torch.from_numpy(executed_action)
         return TensorDict(
             {
                 "observation": torch.from_numpy(self.observation.copy()),
@@ -224,12 +211,12 @@ class RowStates:
                 "episode": torch.from_numpy(self.episode.copy()),
                 "success": success,
                 "fault": fault,
-                "executed_action": torch.from_numpy(executed_action),
+                "executed_action": executed,
                 "done": over,
                 "terminated": terminated,
                 "truncated": over & ~terminated,
                 **more,
             },
             batch_size=(n,),
-            device=torch.device("cpu"),
+            device="cpu",
         )

@@ -15,8 +15,9 @@ from lw_torchrl._util.checks import unknown_name
 from lw_torchrl._util.devices import CPU, check_device, device_of
 from lw_torchrl._util.progress import Progress
 from lw_torchrl._util.workers import Episodes, spread
-from lw_torchrl.envs.episodes import FinishedEpisode, num_rows, policy_of, read_action, run_episodes
+from lw_torchrl.envs.episodes import FinishedEpisode, num_rows, policy_of, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.envs.rows import read_action
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import Task, TaskList
 from lw_torchrl.modules.parts import evaluating

@@ -64,8 +64,7 @@ class Cameras:
     def __init__(self) -> None:
         if _processes - {os.getpid()}:
             raise RuntimeError(
-                "this process was forked from a process that had rendered images, and OpenGL does not work after a "
-                "fork: use mp_start_method='spawn', or render no images before the fork"
+                "this process was forked after rendering, which breaks OpenGL: use mp_start_method='spawn'"
             )
         try:
             self._gl = _open_gl()

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from lw_torchrl._util.checks import typed
 from lw_torchrl.language.objects import typed_position
-from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.suites.engine import Engine, EngineStep
 from lw_torchrl.suites.suite import Suite
 
@@ -43,19 +42,13 @@ class Finding:
 
 @typed
 def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
-    """Run a few time steps of each task and compare the results with the suite's layout.
+    """Run a few time steps of two rows of each task, compare the results with the suite's layout, and return a
+    :class:`Finding` for each measurement, ordered by task.
 
-    The engine runs two rows of each task. The checks cover:
-
-    - the interface: types and shapes of the engine's results, the same episode for the same seed, no change in inactive
-      rows, and correct values of the previous time step;
-    - the hand: the direction of each displacement axis, the distance per time step (``reach``), and a prompt stop;
-    - the gripper: it opens and closes, and, if ``binary_gripper``, no slower than in Meta-World;
-    - the objects: they stay in place while the hand moves, and rest at a plausible height above the table;
-    - the success: not every episode succeeds while the hand rests.
-
-    Returns:
-        A :class:`Finding` for each measurement, ordered by task.
+    The checks cover the interface (types and shapes, seeds, inactive rows, values of the previous step), the hand
+    (direction of each axis, distance per time step, prompt stop), the gripper (it opens and closes, and, if
+    ``binary_gripper``, no slower than in Meta-World), the objects (they stay in place while the hand moves, and rest at
+    a plausible height above the table) and the success (not every episode succeeds while the hand rests).
 
     Example:
         >>> from lw_torchrl.suites import check_suite, load_suite
@@ -66,9 +59,7 @@ def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
     heights: list[float] = []
     for task in suite.tasks:
         with closing(suite.make_engine([task, task], reward="sparse", num_threads=1)) as engine:
-            bench = _Bench(suite, task, engine, seed)
-            findings += [Finding(task, *row) for row in bench.rows()]
-            heights += bench.heights
+            findings += [Finding(task, *row) for row in _Bench(suite, task, engine, seed, heights).rows()]
     if suite.layout.displacement is not None and min(heights, default=0.0) > _LOWEST:
         lowest = f"z = {min(heights) * 100:.1f} cm"
         findings.append(Finding("all", "the lowest object or hand", lowest, "z is the height above the table", False))
@@ -78,11 +69,9 @@ def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
 class _Bench:
     """A two-row test batch of one task: row 0 receives actions that move the hand, row 1 stays inactive."""
 
-    def __init__(self, suite: Suite, task: str, engine: Engine, seed: int) -> None:
-        self.suite, self.layout, self.engine, self.seed = suite, suite.layout, engine, seed
-        self.task = suite.tasks[task]
-        self.hand = self.layout.positions[0]
-        self.heights: list[float] = []
+    def __init__(self, suite: Suite, task: str, engine: Engine, seed: int, heights: list[float]) -> None:
+        self.suite, self.layout, self.engine, self.seed, self.heights = suite, suite.layout, engine, seed, heights
+        self.task, self.hand = suite.tasks[task], suite.layout.positions[0]
 
     def reset(self, seed: int | None = None) -> Array:
         return np.array(self.engine.reset([0], [self.seed if seed is None else seed]))[0]
@@ -135,15 +124,11 @@ class _Bench:
         yield "an inactive row", "unchanged" if same else "changed", "unchanged", same
         if layout.past is not None:
             pairs = [(walk[0], walk[0]), *pairwise(walk)]  # after a reset, both time steps have the same values
-            kept = all(
-                np.array_equal(now[layout.a_step_before(part)], old[part])
-                for old, now in pairs
-                for part in layout.present
-            )
+            columns = [(layout.a_step_before(part), part) for part in layout.present]
+            kept = all(np.array_equal(now[past], old[part]) for old, now in pairs for past, part in columns)
             wanted = "equal to the previous observation (after a reset: to the current observation)"
             yield "values of the previous step", wanted if kept else "different", wanted, kept
-        gripper = self.task.objects[0].position
-        place = tuple(range(self.hand.start, self.hand.stop))
+        gripper, place = self.task.objects[0].position, tuple(range(self.hand.start, self.hand.stop))
         right = typed_position(gripper) == typed_position(place)
         yield "the gripper's position", f"obs{list(gripper)}", f"obs{list(place)}, the layout's hand", right
 
@@ -159,12 +144,8 @@ class _Bench:
             right = moved.argmax() == axis and abs(moved[axis] - layout.reach) < 0.35 * layout.reach
             wanted = f"{layout.reach * 100:.1f} cm along {name}"
             if axis == 2 and np.abs(moved).max() < 1e-3 * layout.reach:
-                yield (
-                    f"+{name} moves {_AXES[name]}",
-                    "nothing: the hand stays in a plane",
-                    f"{wanted}, or nothing",
-                    True,
-                )
+                nothing = "nothing: the hand stays in a plane"
+                yield f"+{name} moves {_AXES[name]}", nothing, f"{wanted}, or nothing", True
                 continue
             yield f"+{name} moves {_AXES[name]}", f"({measured}) cm a step", wanted, bool(right)
             for number, slot in enumerate(layout.things, 1):
@@ -184,7 +165,8 @@ class _Bench:
         closed = [state[layout.opening] for state in self.run(_SETTLING, close=1.0)]
         if max(opened) - min(closed) < 0.05:
             plan = None if self.suite.plans is None else self.suite.plans.get(self.task.name)
-            needed = plan is not None and _needs_fingers(plan)
+            clauses = [clause for step in plan.steps for clause in step.condition.clauses] if plan is not None else []
+            needed = {"open", "closed"} <= {clause.predicate for clause in clauses if clause.object is None}
             wanted = "opens and closes, as the plan's conditions require" if needed else "fixed, or opens and closes"
             yield "gripper", "does not move", wanted, not needed
             return
@@ -213,9 +195,3 @@ def _describe(answer: Any) -> str:
     if isinstance(answer, EngineStep):
         return f"EngineStep of {', '.join(map(_describe, answer))}"
     return f"{answer.shape} {answer.dtype}" if isinstance(answer, np.ndarray) else type(answer).__name__
-
-
-def _needs_fingers(plan: ConditionalPlan) -> bool:
-    """Return whether a plan has conditions on both an open and a closed gripper."""
-    clauses = [clause for step in plan.steps for clause in step.condition.clauses if clause.object is None]
-    return {"open", "closed"} <= {clause.predicate for clause in clauses}

@@ -52,24 +52,22 @@ class Suite:
     def __post_init__(self) -> None:
         for relation in self.layout.thresholds:
             check_choice(f"thresholds of layout {self.layout.name!r}", relation, PREDICATES)
+        prefix = "" if self.name == "metaworld" else f"{self.name}/"
         for name, task in self.tasks.items():
-            if task.name != name:
-                raise ValueError(f"tasks of suite {self.name!r} must map names to tasks, got {task.name!r} as {name!r}")
-            if task.layout != self.layout:
-                raise ValueError(f"task {name!r} must have the layout of suite {self.name!r}, got {task.layout.name!r}")
-            if self.name != "metaworld" and not name.startswith(f"{self.name}/"):
-                raise ValueError(f"tasks of suite {self.name!r} must be named '{self.name}/...', got {name!r}")
+            if task.name != name or task.layout != self.layout or not name.startswith(prefix):
+                wanted = f"names '{prefix}...' to tasks with the layout {self.layout.name!r}"
+                raise ValueError(f"tasks must map {wanted}, got {name!r}: {task.name!r} with {task.layout.name!r}")
         if self.plans is not None and (other := set(self.plans) - set(self.tasks)):
-            unknown = ", ".join(sorted(other))
-            raise ValueError(f"plans of suite {self.name!r} must be for tasks in the suite, got plans for {unknown}")
+            raise ValueError(
+                f"plans of suite {self.name!r} must be for its tasks, got plans for {', '.join(sorted(other))}"
+            )
         if not isinstance(self.tasks, ReadOnlyDict):
             object.__setattr__(self, "tasks", ReadOnlyDict(dict(sorted(self.tasks.items()))))
 
     def named_tasks(self, tasks: TaskList, own: Tasks | None = None) -> dict[str, Task]:
         """Return a dict from full task name to task, sorted by name. ``tasks`` is the suite's name (for all tasks), a
         task's name with or without the suite's prefix, a :class:`Task`, or a list of these; names are also looked up
-        in ``own``.
-        """
+        in ``own``."""
         known = {**self.tasks, **own} if own else self.tasks
         if tasks == self.name:
             return dict(self.tasks)
@@ -117,8 +115,7 @@ def load_suite(suite: str | Suite) -> Suite:
 
 def suite_name(task: str) -> str:
     """Return the name of a task's suite: the prefix of the task's name, or "metaworld" for a name without a prefix. The
-    name of a suite is returned unchanged.
-    """
+    name of a suite is returned unchanged."""
     # SUITES reads the entry points of all installed packages, which is slow, so check known names first.
     is_metaworld = task in (*TASKS, "MT10", "MT50")
     return task.partition("/")[0] if "/" in task or (not is_metaworld and task in SUITES) else "metaworld"

@@ -23,34 +23,16 @@ needs_no_gpu = pytest.mark.skipif(torch.accelerator.is_available(), reason="need
 def test_pretend_device_is_never_waited_for():
     paths = [str(HERE), *(str(HERE.parent / room) for room in ("training", "objectives")), *sys.path]
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(HERE / "on_a_pretend_device.py")]
-    done = subprocess.run(
-        command,
-        cwd=HERE.parent.parent,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=400,
-    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    options = {"cwd": HERE.parent.parent, "env": environment, "capture_output": True, "text": True, "timeout": 400}
+    done = subprocess.run(command, **options)
     assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-2000:]
     assert " passed" in done.stdout
 
 
 def test_cpu_is_available():
-    assert check_device("device", "cpu") == check_device("device", torch.device("cpu")) == CPU
-    assert device_of(torch.nn.Module()) == CPU
-
-
-@needs_no_gpu
-def test_auto_is_the_cpu_without_a_gpu(demos, tmp_path):
-    assert check_device("device", "auto") == CPU
-    actor, replay = lw.PlanConditionedActor(PLANS), make_replay(demos)
-    for call in (
-        lambda: make_replay(demos, "cuda"),
-        lambda: lw.BehavioralCloningTrainer(actor, replay, device="cuda"),
-        lambda: lw.evaluate(actor, tasks="reach", seed=0, device="cuda"),
-    ):
-        with pytest.raises(ValueError, match="device must be 'cpu', 'auto' or a device of this machine, got 'cuda'"):
-            call()
+    assert check_device("device", "cpu") == check_device("device", CPU) == device_of(torch.nn.Module()) == CPU
+    assert torch.accelerator.is_available() or check_device("device", "auto") == CPU
 
 
 @needs_no_gpu
@@ -126,12 +108,11 @@ def test_gpu_steps_are_captured_and_resume_bit_for_bit(demos, tmp_path):
 
 @needs_a_gpu
 def test_gpu_environment_equals_the_cpus():
-    found = []
+    observations = []
     for device in ("cuda", "cpu"):
         env = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], max_steps=9, device=device), lw.QAFTransform(PLANS))
-        actor = lw.ScriptedSkillActor(PLANS).to(device)
-        rollout = env.rollout(12, actor, break_when_any_done=False)
+        rollout = env.rollout(12, lw.ScriptedSkillActor(PLANS).to(device), break_when_any_done=False)
         assert {value.device.type for value in rollout.values(True, True)} == {device}
-        found.append(rollout.cpu())
+        observations.append(rollout["next", "observation"].cpu())
         env.close()
-    torch.testing.assert_close(found[0]["next", "observation"], found[1]["next", "observation"], atol=1e-4, rtol=0.0)
+    torch.testing.assert_close(*observations, atol=1e-4, rtol=0.0)

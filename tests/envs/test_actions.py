@@ -3,28 +3,24 @@
 import pytest
 import torch
 from rows import ROWS, advance, others, same
-from torch import Tensor
 
 
-def layouts(values: Tensor) -> dict[str, Tensor]:
-    """Return the same (6, 4) numbers in different memory layouts."""
-    wide = torch.zeros(ROWS, 8)
-    wide[:, ::2] = values
-    return {
-        "contiguous": values.clone(),
-        "transposed": values.t().clone().t(),
-        "strided": wide[:, ::2],
-        "grad": values.clone().requires_grad_(),
-        "not a leaf": values.clone().requires_grad_() * 1.0,
-        "expanded": values[:1].clone().expand(ROWS, 4),
-    }
-
-
-@pytest.mark.parametrize("layout", ["contiguous", "transposed", "strided", "grad", "not a leaf", "expanded"])
+@pytest.mark.parametrize(
+    "layout",
+    [
+        torch.clone,
+        lambda values: values.t().clone().t(),
+        lambda values: torch.cat([values, values], 1)[:, ::2],
+        lambda values: values.clone().requires_grad_(),
+        lambda values: values.clone().requires_grad_() * 1.0,
+        lambda values: values[:1].clone().expand(ROWS, 4),
+    ],
+    ids=["contiguous", "transposed", "strided", "grad", "not a leaf", "expanded"],
+)
 def test_an_action_out_of_range_is_executed_clipped_and_does_not_change(any_env, layout):
     wild = torch.linspace(-4, 4, 24).reshape(ROWS, 4)
     wild[0, 0], wild[5, 3] = -torch.inf, torch.inf
-    action = layouts(wild)[layout]
+    action = layout(wild)
     wild = action.detach().clone()
     any_env.set_seed(1)
     expected = advance(any_env, any_env.reset(), wild.clamp(-1, 1))
@@ -52,16 +48,8 @@ def test_executed_action_is_zero_after_reset_at_rest_and_for_nan(env):
 
 @pytest.mark.parametrize(
     "action",
-    [
-        torch.zeros(ROWS, 5),
-        torch.zeros(ROWS, 3),
-        torch.zeros(ROWS),
-        torch.zeros(ROWS, 1, 4),
-        torch.zeros(ROWS, 4, dtype=torch.float64),
-        torch.zeros(ROWS, 4, dtype=torch.int64),
-        torch.zeros(ROWS, 4, dtype=torch.bfloat16),
-        None,
-    ],
+    [None, *map(torch.zeros, [(ROWS, 5), (ROWS, 3), (ROWS,), (ROWS, 1, 4)])]
+    + [torch.zeros(ROWS, 4, dtype=dtype) for dtype in (torch.float64, torch.int64, torch.bfloat16)],
     ids=lambda a: "none" if a is None else f"{tuple(a.shape)}-{a.dtype}",
 )
 def test_a_wrong_action_is_an_error_and_moves_nothing(any_env, action):

@@ -42,19 +42,16 @@ def make_collector(kind, actor, batches=None):
     if kind == "ray":
         from torchrl.collectors.distributed import RayCollector
 
-        collector = RayCollector(
-            numbered(make_push_reach, 2),
-            actor,
-            frames_per_batch=2 * ROWS * STEPS,
-            total_frames=10_000 * ROWS * STEPS,
-            collector_kwargs={"auto_register_policy_transforms": False},
-            remote_configs={"num_cpus": 1, "num_gpus": 0, "memory": 2**28},
-        )
+        options = {
+            "collector_kwargs": {"auto_register_policy_transforms": False},
+            "total_frames": 10_000 * ROWS * STEPS,
+        }
+        options |= {"remote_configs": {"num_cpus": 1, "num_gpus": 0, "memory": 2**28}}
+        collector = RayCollector(numbered(make_push_reach, 2), actor, frames_per_batch=2 * ROWS * STEPS, **options)
         collector.update_policy_weights_()  # a RayCollector starts without weights
         return collector
     cls, makers, options = KINDS[kind]
-    workers = len(makers) if isinstance(makers, list) else 1
-    frames = 2 * ROWS * STEPS * workers
+    frames = 2 * ROWS * STEPS * (len(makers) if isinstance(makers, list) else 1)
     total = -1 if batches is None else batches * frames
     return cls(makers, actor, frames_per_batch=frames, total_frames=total, **options)
 

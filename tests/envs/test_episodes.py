@@ -29,18 +29,16 @@ def plain_env(num_envs: int, max_steps: int = STEPS) -> lw.LanguageWorldEnv:
     return lw.LanguageWorldEnv(TASKS, num_envs=num_envs, seed=SEED, max_steps=max_steps, reward="dense")
 
 
+@cache
+def transformed_env(num_envs: int, max_steps: int = STEPS) -> TransformedEnv:
+    return TransformedEnv(plain_env.__wrapped__(num_envs, max_steps), lw.QAFTransform(lw.load_plans("MT10")))
+
+
 @pytest.fixture(scope="module", autouse=True)
 def close() -> Iterator[None]:
     yield
     plain_env.cache_clear()
     transformed_env.cache_clear()
-
-
-@cache
-def transformed_env(num_envs: int, max_steps: int = STEPS) -> TransformedEnv:
-    plans = lw.load_plans("MT10")
-    env = lw.LanguageWorldEnv(TASKS, num_envs=num_envs, seed=SEED, max_steps=max_steps, reward="dense")
-    return TransformedEnv(env, lw.QAFTransform(plans))
 
 
 def wavy(tensordict: TensorDictBase) -> TensorDictBase:
@@ -84,14 +82,6 @@ def pairs(episodes: dict[str, list[int]]) -> set[tuple[str, int]]:
     return {(task, episode) for task, listed in episodes.items() for episode in listed}
 
 
-def same(left: TensorDictBase, right: TensorDictBase) -> bool:
-    """Return whether two recordings have the same keys and agree in every bit."""
-    keys = set(left.keys(True, True))
-    return keys == set(right.keys(True, True)) and all(torch.equal(left[key], right[key]) for key in keys)
-
-
-# ---- the requested episodes
-
 LISTS = st.lists(st.integers(0, 12), unique=True, max_size=5)
 
 
@@ -107,7 +97,7 @@ def test_each_listed_episode_comes_once_and_is_reproducible(episodes, num_envs, 
     assert recorded.keys() == pairs(episodes)
     for (task, episode), steps in recorded.items():
         assert steps.batch_size == (STEPS,)
-        assert same(steps, expected_steps(task, episode)), (task, episode)
+        assert (steps == expected_steps(task, episode)).all(), (task, episode)
         assert steps["task_id"].unique().tolist() == [lw.task_id(task)]
         assert steps["episode"].unique().tolist() == [episode]
 
@@ -134,11 +124,8 @@ def test_episodes_of_different_lengths_keep_their_index(make):
         recorded = run(env, policy, episodes, keys=keys)
     assert recorded.keys() == pairs(episodes)
     for key, steps in recorded.items():
-        length = ending.get(key, STEPS)
-        assert steps.batch_size == (length,)
         assert steps["next", "fault"].any().item() == (key in ending)
-        expected = expected_steps(*key)[:length]
-        assert torch.equal(steps["observation"], expected["observation"])
+        assert torch.equal(steps["observation"], expected_steps(*key)["observation"][: ending.get(key, STEPS)])
 
 
 def test_the_policy_reads_the_mask_of_active_rows():
@@ -153,7 +140,7 @@ def test_the_policy_reads_the_mask_of_active_rows():
 
     recorded = run(plain_env(5), policy, {"push": [3], "reach": [0, 1, 2]})
     assert recorded.keys() == {("push", 3), ("reach", 0), ("reach", 1), ("reach", 2)}
-    assert all(same(steps, expected_steps(*key)) for key, steps in recorded.items())
+    assert all((steps == expected_steps(*key)).all() for key, steps in recorded.items())
     assert len(masks) == 2 * STEPS, "three episodes on two rows"
     assert [mask.sum().item() for mask in masks] == [3] * STEPS + [1] * STEPS
 
@@ -165,10 +152,7 @@ def test_an_abandoned_run_does_not_change_the_next_one():
         next(episodes)
         episodes.close()
     recorded = run(env, wavy, {"push": [1], "reach": [2]})
-    assert all(same(steps, expected_steps(*key)) for key, steps in recorded.items())
-
-
-# ---- any number of rows
+    assert all((steps == expected_steps(*key)).all() for key, steps in recorded.items())
 
 
 @pytest.mark.parametrize("make", [plain_env, transformed_env])
@@ -181,28 +165,22 @@ def test_results_do_not_depend_on_the_number_of_rows(network, make):
     assert runs[0].keys() == pairs(episodes)
     for other in runs[1:]:
         assert other.keys() == runs[0].keys()
-        assert all(same(runs[0][key], other[key]) for key in other)
+        assert all((runs[0][key] == other[key]).all() for key in other)
     again = run(make(5, 60), in_blocks(network), {"reach": [5]}, **options)
-    assert same(again["reach", 5], runs[0]["reach", 5]), "other episodes must not matter either"
+    assert (again["reach", 5] == runs[0]["reach", 5]).all(), "other episodes must not matter either"
 
 
 def test_blocks_give_the_policys_results(network):
     torch.manual_seed(1)
     states = TensorDict({"observation": torch.randn(200, 39), "row": torch.arange(200)}, [200])
     whole = in_blocks(network)(states.clone())
-    assert set(whole.keys()) == {"observation", "row", "action"}
+    assert (whole.exclude("action") == states).all()
     assert torch.allclose(whole["action"], network(states.clone())["action"], atol=1e-6)
     for size in (1, 2, 63, 64, 65, 128, 130, 199):
         part = in_blocks(network)(states[:size].clone())
-        assert part.batch_size == (size,)
-        assert torch.equal(part["action"], whole["action"][:size]), size
-        assert torch.equal(part["observation"], states["observation"][:size])
-        assert part["row"].tolist() == list(range(size))
+        assert (part == whole[:size]).all(), size
     order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
     assert torch.equal(in_blocks(network)(states[order].clone())["action"], whole["action"][order])
-
-
-# ---- noise
 
 
 @pytest.mark.parametrize("hold", [1, 3])
@@ -226,50 +204,28 @@ def test_noise_depends_only_on_the_episode(hold):
     assert clipped > 0
     quiet = run(plain_env(3), wavy, episodes, clean_action="clean", keys=keys)
     assert all(torch.equal(steps["action"], steps["clean"]) for steps in quiet.values())
-    assert all(same(steps.exclude("clean"), expected_steps(*key)) for key, steps in quiet.items())
-
-
-# ---- stopping early
+    assert all((steps.exclude("clean") == expected_steps(*key)).all() for key, steps in quiet.items())
 
 
 @pytest.mark.parametrize("after", first_fast([0, 7]))
 @pytest.mark.parametrize("make", [plain_env, transformed_env])
 def test_stopping_after_success_does_not_change_success(make, after):
-    length = 110
-    episodes = {"push": [3, 0, 8], "reach": [5, 2, 0, 7, 1]}
-    keys = ["observation", "action", ("next", "success")]
+    length, episodes = 110, {"push": [3, 0, 8], "reach": [5, 2, 0, 7, 1]}
+    keys, noise = ["observation", "action", ("next", "success")], lambda _: (0.2,) * 4
     progress: dict[int | None, list[int]] = {None: [], after: []}
-    runs = {
-        stop: run(
-            make(3, length),
-            lw.ExpertActor(TASKS),
-            episodes,
-            keys=keys,
-            noise=lambda _: (0.2,) * 4,
-            after_success=stop,
-            on_progress=progress[stop].append,
-        )
-        for stop in (None, after)
-    }
+    runs = {}
+    for stop, counts in progress.items():
+        options = {"keys": keys, "noise": noise, "after_success": stop, "on_progress": counts.append}
+        runs[stop] = run(make(3, length), lw.ExpertActor(TASKS), episodes, **options)
     assert runs[after].keys() == runs[None].keys() == pairs(episodes)
-    lengths = []
     for key, whole in runs[None].items():
         assert whole.batch_size == (length,)
-        success = whole["next", "success"].flatten()
-        short = runs[after][key]
-        lengths.append(len(short))
-        assert short["next", "success"].any() == success.any()
-        if success.any():
-            assert len(short) == min(int(success.nonzero()[0]) + 1 + after, length)
-        assert same(short, whole[: len(short)])
-    assert len(set(lengths)) > 3, "episodes of different lengths"
-    assert min(lengths) < length
-    total = len(pairs(episodes)) * length
-    assert sum(progress[after]) == sum(progress[None]) == total
+        success, short = whole["next", "success"].flatten(), runs[after][key]
+        assert len(short) == (min(int(success.nonzero()[0]) + 1 + after, length) if success.any() else length)
+        assert (short == whole[: len(short)]).all()
+    assert len({len(steps) for steps in runs[after].values()}) > 3, "episodes of different lengths"
+    assert sum(progress[after]) == sum(progress[None]) == len(runs[None]) * length
     assert len(progress[after]) < len(progress[None])
-
-
-# ---- errors
 
 
 def test_a_module_may_ask_for_smaller_blocks():

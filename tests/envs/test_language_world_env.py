@@ -34,21 +34,15 @@ def test_keys_shapes_and_types(env):
     env.set_seed(0)
     state = env.rand_step(env.reset())
     flags = {key: ((6, 1), torch.bool) for key in ("success", "fault", "done", "terminated", "truncated")}
-    expected = flags | {
-        "observation": ((6, 39), torch.float32),
-        "task_id": ((6,), torch.int64),
-        "episode": ((6,), torch.int64),
-        "executed_action": ((6, 4), torch.float32),
-    }
-    for key, (shape, dtype) in expected.items():
-        for part in (state, state["next"]):
-            assert (part[key].shape, part[key].dtype) == (shape, dtype), key
-    assert (state["next", "reward"].shape, state["next", "reward"].dtype) == ((6, 1), torch.float32)
-    assert (state["action"].shape, state["action"].dtype) == ((6, 4), torch.float32)
+    ids = {key: ((6,), torch.int64) for key in ("task_id", "episode")}
+    actions = {key: ((6, 4), torch.float32) for key in ("action", "executed_action")}
+    expected = flags | ids | actions | {"observation": ((6, 39), torch.float32), "reward": ((6, 1), torch.float32)}
+    for part, absent in ((state.exclude("next"), "reward"), (state["next"], "action")):
+        shapes = {key: (tuple(value.shape), value.dtype) for key, value in part.items()}
+        assert shapes == {key: value for key, value in expected.items() if key != absent}
     assert env.row_tasks == (*FEW, *FEW)
     assert state["task_id"].tolist() == [lw.task_id(task) for task in env.row_tasks]
-    assert env.action_spec.space.low.unique().tolist() == [-1.0]
-    assert env.action_spec.space.high.unique().tolist() == [1.0]
+    assert (env.action_spec.space.low.unique(), env.action_spec.space.high.unique()) == (-1.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -91,35 +85,30 @@ def test_every_task_starts_and_moves_as_in_metaworld(mt50, metaworld_env):
     mt50.rollout(7)
     mt50.reset(TensorDict({"_reset": torch.arange(50) % 3 == 0}, [50]))
     mt50.rollout(4)
-    named = mt50.reset(episode=17)
-    states = [named]
+    states = [mt50.reset(episode=17)]
     actions = torch.stack([actions_of(number, 17, 8) for number in range(50)], 1)
     for action in actions:
         states.append(advance(mt50, states[-1], action))
     mt50.set_seed(3)
-    first = mt50.reset()["observation"]
-    wrong, moved = [], 0
+    first = mt50.reset()["observation"].numpy()
+    observations = torch.stack([state["observation"] for state in states], 1).numpy()
+    rewards = torch.stack([state["reward"] for state in states[1:]], 1).numpy()
+    wrong = []
     for number, task in enumerate(lw.MT50):
         own = metaworld_env(task)
         own.seed(episode_seed(task, 3, 17))
-        expected = [own.reset()[0].astype(np.float32)]
-        rewards = []
-        for action in actions[:, number].numpy():
-            observation, reward, *_ = own.step(action)
-            expected.append(observation.astype(np.float32))
-            rewards.append(np.float32(reward))
-        observations = np.stack([state["observation"][number].numpy() for state in states])
-        if not np.array_equal(observations, np.stack(expected)):
-            wrong.append((task, "trajectory"))
-        if [state["reward"][number].item() for state in states[1:]] != rewards:
-            wrong.append((task, "reward"))
-        moved += not np.array_equal(observations[0], observations[-1])
+        expected = [own.reset()[0], *(own.step(action)[:2] for action in actions[:, number].numpy())]
+        steps = [expected[0], *(observation for observation, _ in expected[1:])]
         own.seed(episode_seed(task, 3, 0))
-        if not np.array_equal(first[number].numpy(), own.reset()[0].astype(np.float32)):
-            wrong.append((task, "episode 0"))
+        pairs = {
+            "trajectory": (observations[number], np.array(steps, np.float32)),
+            "reward": (rewards[number].flatten(), np.array([reward for _, reward in expected[1:]], np.float32)),
+            "episode 0": (first[number], own.reset()[0].astype(np.float32)),
+        }
+        wrong += [(task, name) for name, (ours, theirs) in pairs.items() if not np.array_equal(ours, theirs)]
         own.close()
     assert not wrong
-    assert moved == 50
+    assert (observations[:, 0] != observations[:, -1]).any(-1).all(), "every task must move"
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -130,8 +119,7 @@ def test_eighty_steps_and_dense_rewards_equal_metaworlds(metaworld_env, scale, e
     env = lw.LanguageWorldEnv(tasks, seed=2, reward="dense", engine=engine)
     expert = lw.ExpertActor(tasks)
     state = env.reset()
-    owns = [metaworld_env(task) for task in tasks]
-    for own, task in zip(owns, tasks, strict=True):
+    for own, task in zip(owns := [metaworld_env(task) for task in tasks], tasks, strict=True):
         own.seed(episode_seed(task, 2, 0))
         own.reset()
     successes = 0

@@ -5,7 +5,6 @@ import re
 import signal
 import subprocess
 import sys
-import textwrap
 import threading
 import time
 import warnings
@@ -48,9 +47,6 @@ def tree(root):
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-# ---- parts
-
-
 @given(st.dictionaries(st.sampled_from("abcdef"), st.lists(st.integers(), max_size=150)), st.integers(1, 20))
 def test_parts_hold_each_episode_once_and_are_of_equal_size(episodes, workers):
     parts, together = split(episodes, workers, 64), {}
@@ -67,9 +63,6 @@ def test_parts_hold_few_tasks():
     parts = split({"a": range(2), "b": range(2), "c": range(4)}, 2, 64)
     assert parts == [{"a": [0, 1], "b": [0, 1]}, {"c": [0, 1, 2, 3]}]
     assert [len(part) for part in split(dict.fromkeys("abcdef", range(64)), 3, 64)] == [1] * 6
-
-
-# ---- the same bits
 
 
 @pytest.mark.slow
@@ -90,28 +83,22 @@ def test_the_number_of_workers_changes_no_byte_of_a_dataset(options, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_number_of_workers_changes_no_bit_of_a_result(tmp_path):
+def test_the_number_of_workers_changes_no_bit_of_a_result():
     torch.manual_seed(0)
     actor = lw.PlanConditionedActor(PLANS)
     results, seen = [], []
+    how = {"max_steps": 30, "record_actions": True, "also_record": ["qaf"], "attribute": True, "progress": False}
+    how |= {"evaluator": lw.transforms.CorruptQAF(PLANS, flip=0.2, seed=1), "episodes_per_task": 3, "seed": 7}
     for workers in (1, 2, 3):
         episodes = []
-        how = {"max_steps": 30, "record_actions": True, "also_record": ["qaf"], "on_episode": episodes.append}
-        how |= {"evaluator": lw.transforms.CorruptQAF(PLANS, flip=0.2, seed=1), "attribute": True}
-        results.append(
-            evaluate(actor, tasks=TASKS, episodes_per_task=3, seed=7, workers=workers, progress=False, **how)
-        )
-        seen.append({(e.task, e.episode): e.steps for e in episodes})
-        results[-1].save(tmp_path / f"{workers}.json")
-    for result, episodes in zip(results[1:], seen[1:], strict=True):
+        results.append(evaluate(actor, tasks=TASKS, workers=workers, on_episode=episodes.append, **how))
+        seen.append({(e.task, e.episode): e.steps["qaf"] for e in episodes})
+    for result, qaf in zip(results[1:], seen[1:], strict=True):
         assert result == results[0]
         pairs = zip(result.episodes, results[0].episodes, strict=True)
         assert all(torch.equal(one.actions, other.actions) for one, other in pairs)
-        assert episodes.keys() == seen[0].keys()
-        assert all(torch.equal(steps["qaf"], seen[0][key]["qaf"]) for key, steps in episodes.items())
-
-
-# ---- what runs where
+        assert qaf.keys() == seen[0].keys()
+        assert all(torch.equal(values, seen[0][key]) for key, values in qaf.items())
 
 
 def where(part, on_steps):
@@ -137,10 +124,8 @@ def test_little_work_stays_in_this_process(monkeypatch):
 
 def test_a_worker_starts_no_workers():
     def run(part, on_steps):
-        pids = {
-            item[2] for item in spread(where, {"push": range(9)}, print, workers=None, max_steps=100_000, largest=64)
-        }
-        assert pids == {os.getpid()}
+        items = spread(where, {"push": range(9)}, print, workers=None, max_steps=100_000, largest=64)
+        assert {pid for *_, pid in items} == {os.getpid()}
         return where(part, on_steps)
 
     assert os.getpid() not in run_where(2, run=run)
@@ -175,27 +160,25 @@ def test_functions_stay_in_this_process_unless_workers_is_given(monkeypatch, tmp
     assert len(calls) == 6
 
 
+SCRIPT = """
+import torch, lw_torchrl as lw
+print("once", flush=True)
+class Still(torch.nn.Module):
+    def forward(self, state):
+        return state.set("action", torch.zeros(*state.batch_size, 4))
+run = dict(episodes_per_task=2, seed=0, max_steps=5, progress=False)
+results = [lw.evaluate(Still(), tasks=["push", "reach"], workers=workers, **run) for workers in (1, 2)]
+print(results[0] == results[1])
+"""
+
+
 @pytest.mark.slow
 def test_a_script_without_a_guard_runs_once(tmp_path):
     """The policy's class is the script's own, and workers do not import the script."""
     script = tmp_path / "script.py"
-    program = """
-        import sys
-        import torch, lw_torchrl as lw
-        print("once", flush=True)
-        class Still(torch.nn.Module):
-            def forward(self, state):
-                return state.set("action", torch.zeros(*state.batch_size, 4))
-        run = dict(episodes_per_task=2, seed=0, max_steps=5, progress=False)
-        results = [lw.evaluate(Still(), tasks=["push", "reach"], workers=workers, **run) for workers in (1, 2)]
-        print(results[0] == results[1])
-    """
-    script.write_text(textwrap.dedent(program))
+    script.write_text(SCRIPT)
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=240)
     assert (done.stdout, done.returncode) == ("once\nTrue\n", 0), done.stderr
-
-
-# ---- faults
 
 
 def test_an_error_keeps_its_type_and_names_the_episodes():
@@ -219,12 +202,12 @@ def test_warnings_are_issued_in_this_process():
     assert {str(warning.message) for warning in caught} == {"a fault in ['push']", "a fault in ['reach']"}
 
 
-def marking(folder, seconds=100.0):
-    """Return a function that runs for some time in each worker and leaves a file with the worker's process id."""
+def marking(folder, push=100.0, reach=100.0):
+    """Return a function that leaves a file with its worker's process id, and works for some seconds."""
 
     def run(part, on_steps):
         (folder / str(os.getpid())).touch()
-        time.sleep(seconds)
+        time.sleep(push if "push" in part else reach)
         return where(part, on_steps)
 
     return run
@@ -248,27 +231,23 @@ def test_a_killed_worker_is_an_error_and_ends_the_others(tmp_path):
 
 
 def test_an_abandoned_iteration_ends_the_workers(tmp_path):
-    def run(part, on_steps):
-        (tmp_path / str(os.getpid())).touch()
-        time.sleep(1.0 if "reach" in part else 100.0)
-        return where(part, on_steps)
-
-    with closing(spread(run, {"reach": [0], "push": [0]}, print, workers=2, max_steps=1, largest=64)) as items:
+    options = {"workers": 2, "max_steps": 1, "largest": 64}
+    with closing(spread(marking(tmp_path, reach=1.0), {"reach": [0], "push": [0]}, print, **options)) as items:
         assert next(items)[0] == "reach"
         wait_for(lambda: len(marked(tmp_path)) == 2)
     wait_for(lambda: not any(map(lives, marked(tmp_path))), 10)
 
 
 PROGRAM = """
-    import os, pathlib, sys, time
-    from lw_torchrl._util.workers import spread
+import os, pathlib, time
+from lw_torchrl._util.workers import spread
 
-    def run(part, on_steps):
-        (pathlib.Path(sys.argv[1]) / str(os.getpid())).touch()
-        time.sleep(100)
-        return []
+def run(part, on_steps):
+    (pathlib.Path(FOLDER) / str(os.getpid())).touch()
+    time.sleep(100)
+    return []
 
-    list(spread(run, {"push": range(6)}, print, workers=2, max_steps=1, largest=64))
+list(spread(run, {"push": range(6)}, print, workers=2, max_steps=1, largest=64))
 """
 
 
@@ -276,7 +255,7 @@ PROGRAM = """
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_no_worker_survives_this_process(number, tmp_path):
     """Ctrl-C reaches all processes of a terminal, and only this one prints a traceback."""
-    command = [sys.executable, "-c", textwrap.dedent(PROGRAM).replace("sys.argv[1]", repr(str(tmp_path)))]
+    command = [sys.executable, "-c", PROGRAM.replace("FOLDER", repr(str(tmp_path)))]
     main = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     wait_for(lambda: len(marked(tmp_path)) == 2)
     (os.killpg if number == signal.SIGINT else os.kill)(main.pid, number)

@@ -1,6 +1,7 @@
 """state_dict holds seed and episode counters: an environment that loads it continues with the next episodes."""
 
 import io
+from functools import partial
 
 import pytest
 import torch
@@ -24,58 +25,40 @@ def make_transformed(seed: int = 5) -> TransformedEnv:
     return TransformedEnv(make_env(seed), Compose(lw.QAFTransform(lw.load_plans("MT10")), StepCounter()))
 
 
+def transformed(env) -> TransformedEnv:
+    return TransformedEnv(env, lw.QAFTransform(lw.load_plans("MT10")))
+
+
+FORK = {"mp_start_method": "fork"}
 MAKERS = {
     "plain": make_env,
     "transformed": make_transformed,
     "serial": lambda seed=5: SerialEnv(2, make_transformed, create_env_kwargs={"seed": seed}),
-    "outside": lambda seed=5: TransformedEnv(
-        SerialEnv(2, make_env, create_env_kwargs={"seed": seed}), lw.QAFTransform(lw.load_plans("MT10"))
-    ),
-    "parallel": lambda seed=5: TransformedEnv(
-        ParallelEnv(2, make_transformed, create_env_kwargs={"seed": seed}, mp_start_method="fork"),
-        lw.QAFTransform(lw.load_plans("MT10")),
-    ),
+    "outside": lambda seed=5: transformed(SerialEnv(2, make_env, create_env_kwargs={"seed": seed})),
+    "parallel": lambda seed=5: transformed(ParallelEnv(2, make_transformed, create_env_kwargs={"seed": seed}, **FORK)),
     "parallel, no buffers": lambda seed=5: ParallelEnv(
-        2,
-        make_env,
-        create_env_kwargs=[{"seed": seed, "worker": (w, 2)} for w in range(2)],
-        mp_start_method="fork",
-        use_buffers=False,
+        2, [partial(make_env, seed, worker=(w, 2)) for w in range(2)], use_buffers=False, **FORK
     ),
 }
 
 
-def expected_and_actual(make, seed: int) -> tuple[list, list]:
-    """Return the third reset of an environment, and of another one that loaded its state before."""
-    env, other = make(), make(seed)
+@pytest.mark.parametrize("name", first_fast(MAKERS, 2))
+def test_loading_a_state_continues_with_the_next_episodes(name):
+    env, other = MAKERS[name](), MAKERS[name](77)
     for _ in range(2):
         env.rollout(2)
     other.rollout(1)
-    state = torch.load(buffered(env.state_dict()), weights_only=True)
-    expected = env.reset()
-    other.load_state_dict(state)
-    loaded = other.reset()
+    torch.save(env.state_dict(), file := io.BytesIO())
+    file.seek(0)
+    other.load_state_dict(torch.load(file, weights_only=True))
+    expected, loaded = env.reset(), other.reset()
+    assert expected["episode"].min() >= 2, "the third episodes"
     still = torch.zeros(*env.batch_size, 4)
-    moved = [e.step(td.clone().set("action", still))["next"] for e, td in ((env, expected), (other, loaded))]
-    assert torch.equal(moved[0]["observation"], moved[1]["observation"])
+    moved = [each.step(td.clone().set("action", still)) for each, td in ((env, expected), (other, loaded))]
+    for key in ("episode", "observation", ("next", "observation")):
+        assert torch.equal(moved[0][key], moved[1][key])
     env.close()
     other.close()
-    return [expected["episode"], expected["observation"]], [loaded["episode"], loaded["observation"]]
-
-
-def buffered(state: dict):
-    """Save a state as a user does."""
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return file
-
-
-@pytest.mark.parametrize("name", first_fast(MAKERS, 2))
-def test_loading_a_state_continues_with_the_next_episodes(name):
-    expected, actual = expected_and_actual(MAKERS[name], seed=77)
-    assert expected[0].min() >= 2, "the third episodes"
-    assert all(torch.equal(left, right) for left, right in zip(expected, actual, strict=True))
 
 
 def test_loading_a_state_ends_all_episodes():
@@ -88,39 +71,32 @@ def test_loading_a_state_ends_all_episodes():
     env.close()
 
 
-def policy() -> TensorDictModule:
-    return TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
+def make_collector(make, policy) -> Collector:
+    return Collector(make(), policy, frames_per_batch=30, total_frames=-1, auto_register_policy_transforms=False)
 
 
 @pytest.mark.parametrize("name", ["transformed", "serial", "outside"])
 def test_a_resumed_collector_continues_with_the_next_episodes(name):
-    def collector() -> Collector:
-        return Collector(
-            MAKERS[name](), policy(), frames_per_batch=6 * 5, total_frames=-1, auto_register_policy_transforms=False
-        )
-
-    def episodes(batch) -> set[tuple[int, ...]]:
+    def episodes(collector) -> set[tuple[int, int]]:
+        batch = next(iter(collector))
         return set(zip(batch["task_id"].flatten().tolist(), batch["episode"].flatten().tolist(), strict=True))
 
-    first = collector()
-    seen = episodes(next(iter(first)))
-    saved = first.state_dict()
-    first.shutdown()
-    second = collector()
-    second.load_state_dict(saved)
+    first, second = (
+        make_collector(MAKERS[name], TensorDictModule(nn.Linear(39, 4), ["observation"], ["action"])) for _ in range(2)
+    )
+    seen = episodes(first)
+    second.load_state_dict(first.state_dict())
     second.reset()
-    after = episodes(next(iter(second)))
-    second.shutdown()
+    after = episodes(second)
+    for collector in (first, second):
+        collector.shutdown()
     assert len(after) >= 6
     assert not seen & after
 
 
 def test_a_collector_continues_after_a_reset():
     """Its reset sets the environment's tensors to zero."""
-    actor = lw.PlanConditionedActor(lw.load_plans("MT10"))
-    collector = Collector(
-        make_transformed(), actor, frames_per_batch=15, total_frames=-1, auto_register_policy_transforms=False
-    )
+    collector = make_collector(make_transformed, lw.PlanConditionedActor(lw.load_plans("MT10")))
     for _ in range(2):
         assert next(iter(collector))["qaf_plan"].all()
         collector.reset()

@@ -1,10 +1,8 @@
 """Numbered workers run the episodes of one environment with all their rows; forked processes and threads."""
 
-import multiprocessing
 import os
+import signal
 import sys
-import warnings
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import pytest
@@ -20,14 +18,6 @@ pytestmark = pytest.mark.filterwarnings(
 )
 
 
-def four_rows() -> torch.Tensor:
-    """Return the first observations of two resets of an environment with four rows, (2, 4, 39)."""
-    env = make_env(num_envs=4)
-    states = [env.reset() for _ in range(2)]
-    env.close()
-    return torch.stack([state["observation"] for state in states])
-
-
 BATCHED = {
     "serial": lambda makers: SerialEnv(2, makers),
     "parallel, fork": lambda makers: ParallelEnv(2, makers, mp_start_method="fork"),
@@ -39,12 +29,13 @@ BATCHED = {
 @pytest.mark.parametrize("make", [make_env, make_transformed])
 @pytest.mark.parametrize("name", first_fast(BATCHED, 2))
 def test_a_batch_of_environments_runs_the_episodes_of_a_large_one(name, make):
-    env = BATCHED[name](numbered(make, 2))
-    states = [env.reset() for _ in range(2)]
+    env, large = BATCHED[name](numbered(make, 2)), make_env(num_envs=4)
+    for expected in ([[0, 1], [2, 3]], [[4, 5], [6, 7]]):
+        state = env.reset()
+        assert state["episode"].tolist() == expected
+        assert torch.equal(state["observation"].flatten(0, 1), large.reset()["observation"])
     env.close()
-    assert states[0]["episode"].tolist() == [[0, 1], [2, 3]]
-    assert states[1]["episode"].tolist() == [[4, 5], [6, 7]]
-    assert torch.equal(torch.stack([state["observation"].flatten(0, 1) for state in states]), four_rows())
+    large.close()
 
 
 def test_workers_in_workers_run_different_episodes():
@@ -54,47 +45,28 @@ def test_workers_in_workers_run_different_episodes():
         env.close()
 
 
-def test_unnumbered_workers_run_the_same_episodes():
-    env = SerialEnv(2, make_env)
-    assert env.reset()["episode"].tolist() == [[0, 1], [0, 1]]
-    env.close()
-
-
-def test_workers_differ_after_set_seed():
-    env = SerialEnv(2, numbered(make_env, 2))
-    env.set_seed(0)
-    first = env.reset()["observation"]
-    env.set_seed(0)
-    assert torch.equal(env.reset()["observation"], first)
-    assert first.flatten(0, 1).unique(dim=0).shape == (4, 39)
+@pytest.mark.parametrize(("makers", "second"), [(make_env, [0, 1]), (numbered(make_env, 2), [2, 3])])
+def test_workers_differ_only_if_they_are_numbered(makers, second):
+    env = SerialEnv(2, makers)
+    for _ in range(2):
+        env.set_seed(0)
+        assert env.reset()["episode"].tolist() == [[0, 1], second]
     env.close()
 
 
 def test_numbered_environments_run_different_episodes():
     envs = [make_env(worker=(w, 3)) for w in range(3)]
-    assert [env.reset()["episode"].tolist() for env in envs] == [[0, 1], [2, 3], [4, 5]]
-    assert [env.reset()["episode"].tolist() for env in envs] == [[6, 7], [8, 9], [10, 11]]
     assert [env.worker for env in envs] == [(0, 3), (1, 3), (2, 3)]
+    for first in (0, 6):
+        assert [env.reset()["episode"].tolist() for env in envs] == [
+            [first + 2 * w, first + 2 * w + 1] for w in range(3)
+        ]
     envs[1].set_seed(3)
     assert envs[1].reset()["episode"].tolist() == [2, 3]
+    envs.append(lw.LanguageWorldEnv(["push", "reach"], num_envs=3, worker=(1, 2), num_threads=1))
+    assert [envs[3].reset()["episode"].tolist() for _ in range(2)] == [[2, 1, 3], [6, 3, 7]], "rows of each task"
     for env in envs:
         env.close()
-
-
-def test_each_task_counts_its_own_rows():
-    env = lw.LanguageWorldEnv(["push", "reach"], num_envs=3, worker=(1, 2), num_threads=1)
-    assert env.reset()["episode"].tolist() == [2, 1, 3]
-    assert env.reset()["episode"].tolist() == [6, 3, 7]
-    env.close()
-
-
-def in_a_fork(env, state, action: str, channel) -> None:
-    try:
-        channel.send((env.reset() if action == "reset" else env.step(state))["episode"].tolist())
-    except RuntimeError as error:
-        channel.send(str(error))
-    channel.close()
-    os._exit(0)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="fork")
@@ -103,28 +75,14 @@ def in_a_fork(env, state, action: str, channel) -> None:
 def test_use_in_a_forked_process_is_an_error(make, action):
     env = make()
     state = still(env.reset())
-    context = multiprocessing.get_context("fork")
-    ours, theirs = context.Pipe()
-    child = context.Process(target=in_a_fork, args=(env, state, action, theirs))
-    child.start()
-    assert ours.poll(30), "the child hangs"
-    assert "forked after the environment was made" in ours.recv()
-    child.join()
+    if not (child := os.fork()):
+        signal.alarm(30)  # ends the child if it hangs
+        try:
+            env.reset() if action == "reset" else env.step(state)
+        except RuntimeError as error:
+            os._exit(0 if "forked after the environment was made" in str(error) else 2)
+        finally:
+            os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     assert not env.step(state)["next", "fault"].any()
     env.close()
-
-
-def test_experts_in_threads_do_not_change_pythons_warnings():
-    state = lw.LanguageWorldEnv("reach", num_envs=4).reset()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        before = list(warnings.filters)
-
-        def act(_):
-            expert = lw.ExpertActor("reach")
-            for _ in range(200):
-                expert(state.copy())
-
-        with ThreadPoolExecutor(3) as threads:
-            list(threads.map(act, range(3)))
-        assert warnings.filters == before

@@ -1,6 +1,5 @@
 """The example's suite of robosuite: its check, its seeds, its plans, and the script itself."""
 
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,19 +16,12 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(scope="module")
-def example():
+def suite():
     pytest.importorskip("robosuite")
-    sys.path.insert(0, str(EXAMPLES))
-    try:
-        import suite_robosuite
-    finally:
-        sys.path.remove(str(EXAMPLES))
-    return suite_robosuite
-
-
-@pytest.fixture(scope="module")
-def suite(example):
-    return example.make_suite("Panda")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(EXAMPLES)
+        from suite_robosuite import make_suite
+    return make_suite("Panda")
 
 
 def test_check_finds_nothing_wrong(suite):
@@ -45,7 +37,7 @@ def test_plans_with_scripted_skills_succeed(task, suite):
     assert lw.evaluate(actor, tasks=f"robosuite/{task}", suite=suite, **run).mean_success == 1.0
 
 
-def test_example_runs_a_metaworld_policy(example, tmp_path):
+def test_example_runs_a_metaworld_policy(suite, tmp_path):
     plans = lw.canonical_plans(lw.load_plans("MT10"))
     features = Concat(ObservationFeatures("opening"), RoleFeatures(plans))
     actor = lw.PlanConditionedActor(plans, features=features, decoder=MLPDecoder(width=8))
@@ -53,7 +45,6 @@ def test_example_runs_a_metaworld_policy(example, tmp_path):
     options = ["--episodes", "1", "--steps", "5", "--arms", "Panda", "IIWA"]
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / "suite_robosuite.py"), str(tmp_path / "policy.safetensors"), *options],
-        env=dict(os.environ),
         capture_output=True,
         text=True,
         timeout=240,

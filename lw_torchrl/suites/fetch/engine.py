@@ -9,7 +9,7 @@ from contextlib import redirect_stderr
 from functools import cache
 from importlib import import_module
 from io import StringIO
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -32,28 +32,25 @@ OPEN = 0.1
 
 
 def our_positions(positions: Array, origin: Array) -> Array:
-    """Convert positions (..., 3) float64 from Fetch's to Meta-World's axes. ``origin`` (..., 3) is the origin of
-    Meta-World's axes in Fetch's axes."""
+    """Convert positions (..., 3) from Fetch's to Meta-World's axes, whose ``origin`` (..., 3) is in Fetch's axes."""
     offset = positions - origin
     return np.stack((-offset[..., 1], offset[..., 0], offset[..., 2]), -1)
 
 
 def our_quaternions(quaternions: Array) -> Array:
-    """Convert rotations, quaternions (..., 4) float64 in w, x, y, z order, from Fetch's to Meta-World's axes. The
-    identity stays the identity."""
+    """Convert rotations (..., 4) in w, x, y, z order from Fetch's to Meta-World's axes; the identity stays the same."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     return np.stack((w, -y, x, z), -1)
 
 
 def turned_quaternions(quaternions: Array) -> Array:
-    """Convert body orientations (..., 4) float64, in w, x, y, z order, from Fetch's to Meta-World's axes."""
+    """Convert body orientations (..., 4) in w, x, y, z order from Fetch's to Meta-World's axes."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     return np.sqrt(0.5) * np.stack((w - z, x - y, x + y, w + z), -1)
 
 
 def fetch_actions(action: NDArray[Any]) -> NDArray[Any]:
-    """Convert actions (..., 4) in Meta-World's axes, where +1 closes the gripper, to gymnasium-robotics actions of the
-    same dtype, where +1 opens the gripper."""
+    """Convert actions (..., 4) from Meta-World's axes, where +1 closes the gripper, to Fetch's, where +1 opens it."""
     return np.stack((action[..., 1], -action[..., 0], action[..., 2], -action[..., 3]), -1)
 
 
@@ -70,37 +67,27 @@ _METRES = 0.05  # metres per unit of displacement
 _SUCCESS = 0.05  # maximum distance to the goal at success, metres
 
 
-class _Scene(NamedTuple):
-    """A task's class in gymnasium-robotics, and the origin of Meta-World's axes in Fetch's axes (metres).
-
-    With this origin, an object on the table has z = 0.018, 2 mm below the threshold of "touching the table", and the
-    hand starts near x = 0, y = 0.6.
-    """
-
-    module: str
-    env: str
-    origin: tuple[float, float, float]
-
-
+# Each task's module and class in gymnasium-robotics, and the origin of Meta-World's axes in Fetch's axes (metres). With
+# this origin, an object on the table has z = 0.018, 2 mm below the threshold of "touching the table", and the hand
+# starts near x = 0, y = 0.6.
 _SCENES = {
-    "fetch/reach": _Scene("reach", "MujocoFetchReachEnv", (0.745, 0.75, 0.40675)),
-    "fetch/push": _Scene("push", "MujocoFetchPushEnv", (0.745, 0.75, 0.40675)),
-    "fetch/slide": _Scene("slide", "MujocoFetchSlideEnv", (0.395, 0.75, 0.3955)),
-    "fetch/pick-and-place": _Scene("pick_and_place", "MujocoFetchPickAndPlaceEnv", (0.745, 0.75, 0.40675)),
+    "fetch/reach": ("reach", "MujocoFetchReachEnv", (0.745, 0.75, 0.40675)),
+    "fetch/push": ("push", "MujocoFetchPushEnv", (0.745, 0.75, 0.40675)),
+    "fetch/slide": ("slide", "MujocoFetchSlideEnv", (0.395, 0.75, 0.3955)),
+    "fetch/pick-and-place": ("pick_and_place", "MujocoFetchPickAndPlaceEnv", (0.745, 0.75, 0.40675)),
 }
 
 
 @cache
 def _builder(task: str) -> Any:
-    """Build the gymnasium-robotics environment of a task. All rows of all engines share the environment's model, which
-    never changes."""
-    scene = _SCENES[task]
+    """Build a task's gymnasium-robotics environment, whose model never changes and is shared by all rows."""
+    scene, env, _ = _SCENES[task]
     with naming_absent_renderer(), redirect_stderr(StringIO()):  # the import prints messages about other environments
         try:
-            module = import_module(f"gymnasium_robotics.envs.fetch.{scene.module}")
+            module = import_module(f"gymnasium_robotics.envs.fetch.{scene}")
         except ImportError as error:
             raise ImportError("the Fetch suite needs the extra [fetch]: pip install 'lw_torchrl[fetch]'") from error
-    return getattr(module, scene.env)()
+    return getattr(module, env)()
 
 
 class _Row:
@@ -124,8 +111,7 @@ class _Row:
         # The joints that actuators drive; controls are relative to the joint positions. Two tasks have no actuators.
         driven = [data.qpos[joint : joint + 1] for joint in self._model.jnt_qposadr[self._model.actuator_trnid[:, 0]]]
         self._target = self._model.site("target0").id
-        # Zeros, from which values are read that the task does not have.
-        none = np.zeros(_DRIVEN.stop)
+        none = np.zeros(_DRIVEN.stop)  # values that the task does not have
         grip = data.site_xpos[self._model.site("robot0:grip").id]
         objects = [none[_OBJECT], none[_QUATERNION]]
         driven = driven or [none[_DRIVEN]]
@@ -141,8 +127,8 @@ class _Row:
         np.concatenate(self._sources, out=read)
 
     def simulate(self, inputs: Array, outputs: Array) -> bool:
-        """Write the inputs (mocap position and quaternion, controls), simulate 20 physics steps, and fill the outputs
-        (21,) with the new state. Return whether the simulation is stable."""
+        """Write the inputs (mocap position and quaternion, controls), simulate 20 physics steps, fill the outputs (21,)
+        with the new state, and return whether the simulation is stable."""
         data = self.data
         self._mocap[0][:], self._mocap[1][:] = inputs[:3], inputs[3:7]
         data.ctrl[:] = inputs[7 : 7 + len(data.ctrl)]
@@ -203,7 +189,7 @@ class FetchEngine(ThreadedEngine):
         n = len(tasks)
         super().__init__([""] * n, FETCH, num_threads)  # models are read-only, so rows need not be grouped by model
         self._rows = [_Row(task) for task in tasks]
-        self._origin = np.array([_SCENES[task].origin for task in tasks]).reshape(n, 3)
+        self._origin = np.array([_SCENES[task][2] for task in tasks]).reshape(n, 3)
         self._has_object = np.array([row.has_object for row in self._rows], dtype=bool)
         self._read = np.zeros((n, _DRIVEN.stop))
         self._compile()

@@ -41,8 +41,7 @@ def make_suite() -> Suite:
 
 
 def _make_engine(row_tasks: Sequence[str], **options: Any) -> Engine:
-    """Return the vectorized engine, or the plain engine if the vectorized engine was not verified against the installed
-    versions."""
+    """Return the vectorized engine, or the plain engine if the installed versions were not verified."""
     if not (changes := version_changes(COMPARED_VERSIONS, COMPARED_VERSIONS)):
         return VectorizedEngine(row_tasks, **options)
     _warn_once(", ".join(changes))

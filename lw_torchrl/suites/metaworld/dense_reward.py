@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._util.checks import check_choice
 from lw_torchrl.suites.metaworld import observation as at
 from lw_torchrl.suites.metaworld import reward_terms as terms
 from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, row_norm
@@ -16,8 +15,8 @@ from lw_torchrl.suites.metaworld.reward_terms import Numbers, hamacher_product, 
 from lw_torchrl.suites.metaworld.tables import FIRST_DISTANCE, TaskReward
 
 Cast = Callable[[Any], Any]
-"""Type of a function that converts numbers to the precision of a formula. The precision is single if the reward depends
-on a float32 action, because NumPy keeps single precision when Python numbers are added."""
+"""A function that converts numbers to the precision of a formula: single if the reward depends on a float32 action,
+because NumPy keeps single precision when Python numbers are added."""
 
 Formula = Callable[["StepState", Index, Cast], Numbers]  # (state, rows, cast) -> rewards (len(rows),)
 
@@ -289,10 +288,6 @@ class EpisodeStarts:
     """The values from each row's first state of the episode that the row's reward depends on."""
 
     def __init__(self, rewards: Sequence[TaskReward]) -> None:
-        for reward in rewards:
-            check_choice("formula", reward.formula, FORMULAS)
-            if reward.lift is not None:
-                check_choice("lift", reward.lift, LIFTS)
         self.rewards = tuple(rewards)
         self.task = terms.make_parameters(rewards)
         self.points = np.zeros((len(rewards), terms.EPISODE.stop - terms.EPISODE.start))

@@ -21,8 +21,7 @@ from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import EngineStep, RowModel
 
 UNSTABLE = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
-"""A slice of MuJoCo's warnings that selects the three about an unstable simulation: bad positions, velocities and
-accelerations."""
+"""MuJoCo's three warnings about an unstable simulation: bad positions, velocities and accelerations."""
 
 
 def import_metaworld() -> Any:
@@ -48,8 +47,7 @@ def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
 
 
 class MetaWorldEngine(SeenRows):
-    """An engine that runs the original Meta-World environments in a loop, in one thread. It is slow and serves as the
-    reference for the vectorized engine."""
+    """An engine that runs Meta-World's own environments in a loop: slow, and the vectorized engine's reference."""
 
     @typed
     def __init__(
@@ -102,11 +100,9 @@ Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class SharedModel:
-    """A compiled model that many rows use in turn.
-
-    Meta-World's resets change the positions of bodies and sites in the model itself. So each row stores its own
-    positions, and loads them before it uses the model, unless it was the last row to do so (the ``holder``).
-    """
+    """A compiled model that many rows use in turn. Meta-World's resets change the positions of bodies and sites in the
+    model itself, so each row stores its own positions, and loads them before it uses the model, unless it was the last
+    row to do so (the ``holder``)."""
 
     def __init__(self, path: str, model: Any, compiled: Places | None = None) -> None:
         self.path, self.model = path, model
@@ -151,9 +147,8 @@ def return_models(models: Iterable[SharedModel]) -> None:
 
 
 WARNED_ALREADY = 1000
-"""A nonzero initial value for MuJoCo's warning counts. MuJoCo prints and logs (MUJOCO_LOG.TXT) a warning only if its
-count is zero, so this value silences it; a count that differs from this value means that a warning occurred.
-"""
+"""The initial value of MuJoCo's warning counts. MuJoCo prints and logs (MUJOCO_LOG.TXT) a warning only if its count is
+zero, so this value silences it; another count means that a warning occurred."""
 
 
 class TaskProgram:

@@ -43,9 +43,8 @@ MATRIX_OF = "matrix of "
 
 
 class StateView:
-    """A flat view of all arrays of a MuJoCo state, which share one block of memory. A single ``take`` can read from all
-    arrays; concatenating ten small arrays would take four times as long. The state must outlive this view.
-    """
+    """A flat view of all arrays of a MuJoCo state, which share one block of memory: a single ``take`` reads from all of
+    them, four times as fast as concatenating ten small arrays. The state must outlive this view."""
 
     def __init__(self, model: Any, data: Any) -> None:
         self._model = model
@@ -61,14 +60,12 @@ class StateView:
 
     def find(self, what: str) -> Index:
         """Return the indices in ``numbers`` of a named quantity: the position (3) of "body NAME", "geom NAME" or "site
-        NAME"; "matrix of geom NAME" (9), or of a body or site; "quaternion of body NAME" (4); or "joint NAME" (1).
-        """
+        NAME"; "matrix of geom NAME" (9), or of a body or site; "quaternion of body NAME" (4); or "joint NAME" (1)."""
         kind, _, name = what.rpartition(" ")
-        if kind not in self._arrays:
-            raise ValueError(f"what must be a name after one of {', '.join(self._arrays)}, got {what!r}")
+        array = self._arrays[kind]
         named = getattr(self._model, kind.split()[-1])(name)
         row = named.qposadr[0] if kind == "joint" else named.id
-        own = self._arrays[kind][row : row + 1]
+        own = array[row : row + 1]
         return (_address(own) - self._start) // own.itemsize + np.arange(own.size)
 
 
@@ -116,9 +113,7 @@ DIAL_RADIUS = 0.05  # metres
 
 
 class Observer:
-    """An observation builder for a fixed set of rows. It does Meta-World's operations in Meta-World's order, so the
-    results are bit-identical.
-    """
+    """An observation builder for a fixed set of rows: Meta-World's operations in Meta-World's order, bit for bit."""
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
         self._dials = np.flatnonzero([row.dial is not None for row in sources])
@@ -142,15 +137,13 @@ class Observer:
 
 def row_norm(vectors: Array) -> Array:
     """Return the Euclidean norm of each row, bit-identical to calling ``np.linalg.norm`` on that row. Both use the BLAS
-    dot product; summing squares over an axis would round differently for one row in nine.
-    """
+    dot product; summing squares over an axis would round differently for one row in nine."""
     return np.sqrt(np.vecdot(vectors, vectors))
 
 
 def quaternion_of_matrix(matrix: Any) -> tuple[float, float, float, float]:
     """Convert a rotation matrix, nine numbers, to a quaternion in x, y, z, w order. The result is bit-identical to
-    SciPy's ``Rotation.from_matrix(...).as_quat()``, which is much slower. The kernel compiles this function.
-    """
+    SciPy's ``Rotation.from_matrix(...).as_quat()``, which is much slower. The kernel compiles this function."""
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix
     trace = m00 + m11 + m22
     # SciPy first computes the largest component, then the other components from it, which loses fewer digits.
@@ -169,8 +162,7 @@ def quaternion_of_matrix(matrix: Any) -> tuple[float, float, float, float]:
 
 class Scene(NamedTuple):
     """The inputs of a success rule: whether each row's point is near the goal (rows,), observed sensors (rows, WIDTH),
-    goals (rows, 3), and points (rows, 3) that must reach the goals.
-    """
+    goals (rows, 3), and points (rows, 3) that must reach the goals."""
 
     near: Mask
     sensors: Array
@@ -185,8 +177,7 @@ STICK_UPWARD = 0.06
 
 class SuccessFunction:
     """A callable that computes the success of a fixed set of rows. ``programs`` maps a row to its current
-    :class:`TaskProgram`, for the one rule that reads contacts.
-    """
+    :class:`TaskProgram`, for the one rule that reads contacts."""
 
     def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:
         success = [row.success for row in sources]

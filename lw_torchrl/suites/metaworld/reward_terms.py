@@ -96,10 +96,7 @@ def _points(reward: TaskReward) -> list[list[list[list[int]]]]:
 
 
 def _less(term: Term) -> float:
-    """Return the offset of a margin, which is ``abs(distance - offset)``.
-
-    The distance is between two reference points; for a constant margin, both points are identical.
-    """
+    """Return the offset of a margin, ``abs(distance - offset)`` of two points, which coincide for a constant margin."""
     if isinstance(term.margin, tuple):
         return term.less
     if term.margin == FIRST_DISTANCE:
@@ -123,8 +120,7 @@ def gather_features(task: Parameters, sensors: Array, current: Array, goal: Arra
 
 
 Numbers = NDArray[np.floating]
-"""An array in single or double precision: Meta-World uses the action's precision if a term depends on the gripper
-action."""
+"""Single or double precision: Meta-World uses the action's precision if a term depends on the gripper action."""
 
 AT_MARGIN = 0.1  # the value of a term whose distance equals the margin
 LONG_TAIL = np.sqrt(1 / AT_MARGIN - 1)

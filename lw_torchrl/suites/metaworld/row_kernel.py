@@ -40,13 +40,11 @@ def _function(library: ctypes.CDLL, name: str, result: Any, *arguments: Any) -> 
     return types.ExternalFunction(name, result(*arguments))
 
 
-mj_step = _function(_mujoco, "mj_step", types.void, _pointer, _pointer)
-mj_forward = _function(_mujoco, "mj_forward", types.void, _pointer, _pointer)
-mj_kinematics = _function(_mujoco, "mj_kinematics", types.void, _pointer, _pointer)
-mj_make_constraint = _function(_mujoco, "mj_makeConstraint", types.void, _pointer, _pointer)
-mj_reference_constraint = _function(_mujoco, "mj_referenceConstraint", types.void, _pointer, _pointer)
+mj_step, mj_forward, mj_kinematics, mj_make_constraint, mj_reference_constraint, mj_euler = (
+    _function(_mujoco, f"mj_{name}", types.void, _pointer, _pointer)
+    for name in ("step", "forward", "kinematics", "makeConstraint", "referenceConstraint", "Euler")
+)
 mj_forward_skip = _function(_mujoco, "mj_forwardSkip", types.void, _pointer, _pointer, _int32, _int32)
-mj_euler = _function(_mujoco, "mj_Euler", types.void, _pointer, _pointer)
 get_error_handler = _function(_mujoco, "_mjPRIVATE__get_tls_error_fn", _pointer)
 set_error_handler = _function(_mujoco, "_mjPRIVATE__set_tls_error_fn", types.void, _pointer)
 clock_gettime = _function(_system, "clock_gettime", _int32, _int32, _pointer)
@@ -168,16 +166,9 @@ def _try_row(row: Any, inputs: Any, outputs: Any, jump: Any) -> bool:
     return stable
 
 
+_table, _integers, _numbers = types.Array(from_dtype(ROW), 1, "C"), types.int64[::1], types.float64[:, ::1]
 _SIGNATURE = types.void(
-    _int64,
-    types.Array(from_dtype(ROW), 1, "C"),
-    types.int64[::1],
-    types.int64[::1],
-    types.int64[::1],
-    types.float64[:, ::1],
-    types.float64[:, ::1],
-    types.boolean[::1],
-    types.boolean,
+    *(_int64, _table, _integers, _integers, _integers, _numbers, _numbers, types.boolean[::1], types.boolean)
 )
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lw_torchrl._util.workers import available_cores
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
-from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
+from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel
 from lw_torchrl.suites.metaworld import observation as at
 from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel
 from lw_torchrl.suites.metaworld.environments import UNSTABLE, WARNED_ALREADY, SharedModel
@@ -70,9 +70,7 @@ class SimulatedRow:
         self._control[...] = inputs[3:]
         if self._looked:
             self._substep_after_look()
-            mujoco.mj_step(self._model, self._data, self._substeps - 1)
-        else:
-            mujoco.mj_step(self._model, self._data, self._substeps)
+        mujoco.mj_step(self._model, self._data, self._substeps - self._looked)
         mujoco.mj_forward(self._model, self._data)  # the next physics step starts its solver from these accelerations
         self._looked = True
         self.read_sensors(outputs)
@@ -242,10 +240,8 @@ def _stop(call: list[Callable[[], object] | None], wakes: Sequence[threading.Loc
 
 
 class ThreadedEngine(SeenRows):
-    """Base class for engines that simulate physics in parallel threads (one per core by default).
-
-    Rows with the same key share a MuJoCo model.
-    """
+    """Base class for engines that simulate physics in parallel threads (one per core by default); rows with the same
+    key share a MuJoCo model."""
 
     _rows: list[Any]  # each has ``seen`` and ``bodies``
 
@@ -265,10 +261,7 @@ class ThreadedEngine(SeenRows):
 
     def _simulate(self, rows: Index, inputs: Array, outputs: Array) -> Mask:
         """Simulate rows with inputs (rows, K), fill outputs (rows, W), and return a bool mask (rows,) of the stable
-        rows.
-
-        Without the kernel, Python threads compute bit-identical results, but make ten slow Python calls per row.
-        """
+        rows. Without the kernel, Python threads compute the same bits, but make ten slow Python calls per row."""
         if self._compiled is not None:
             return self._compiled.simulate(rows, inputs, outputs, self._pool.run)
         stable = np.zeros(len(rows), dtype=bool)
@@ -292,12 +285,10 @@ class ThreadedEngine(SeenRows):
 
     @abstractmethod
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
-        """Step ``rows``, given the actions of all rows, and write their observations, rewards, success flags and
-        errors.
-        """
+        """Step ``rows``, given the actions of all rows; write their observations, rewards, success flags and faults."""
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
-        index, seed_of = seeds_of_rows(rows, seeds)
+        index, seed_of = np.array(rows, dtype=np.intp), dict(zip(rows, seeds, strict=True))
         # If a reset fails half-way, the rows must not be stepped.
         self._started[index] = False
         self._pool.work(self._by_group(index), lambda row: self._reset_row(row, seed_of[row]))
@@ -309,10 +300,16 @@ class ThreadedEngine(SeenRows):
         return self._observation[index]
 
     def step(self, action: NDArray[Any], active: Mask) -> EngineStep:
-        action, active = checked_step(action, active, self._started, self._layout.action_size)
+        n, size = len(self._started), self._layout.action_size
+        if action.shape != (n, size) or active.shape != (n,):
+            raise ValueError(
+                f"action must have shape {(n, size)} and active {(n,)}, got {action.shape}, {active.shape}"
+            )
+        if (waiting := np.flatnonzero(active & ~self._started)).size:
+            raise RuntimeError(f"row {waiting[0]} must be reset before the first step, and after an interrupted step")
         # NaN must not reach the physics: MuJoCo would silently restart the row.
         self._faulted |= active & ~np.isfinite(action).all(axis=1)
-        reward, success = np.zeros(len(active)), np.zeros(len(active), dtype=bool)
+        reward, success = np.zeros(n), np.zeros(n, dtype=bool)
         if (rows := np.flatnonzero(active & ~self._faulted)).size:
             # If a step is interrupted, the rows must be reset.
             self._started[rows] = False
@@ -334,7 +331,6 @@ class ThreadedEngine(SeenRows):
         return BodyPoses(position.copy(), quaternion.copy())
 
     def close(self) -> None:
-        """Stop the threads and free the simulations."""
         super().close()
         self._pool.close()
         self._compiled = None

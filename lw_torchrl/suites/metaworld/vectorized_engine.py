@@ -54,10 +54,7 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
     ) -> None:
         compared = environments.COMPARED_VERSIONS
         if changes := version_changes(compared, compared):
-            raise ImportError(
-                f"engine: the vectorized engine was verified against other versions ({', '.join(changes)}); install "
-                "the verified versions, or use engine='metaworld', which supports any version"
-            )
+            raise ImportError(f"engine: verified against other versions ({', '.join(changes)}); use engine='metaworld'")
         dense, tasks = reward == "dense", [check_task(task) for task in tasks]
         super().__init__([environments.model_path(task) for task in tasks], METAWORLD, num_threads)
         rewards = [reward_table()[task] if dense else None for task in tasks]
@@ -66,13 +63,12 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         # The models are given back even if the engine is never closed.
         self._return_models = weakref.finalize(self, environments.return_models, models)
         for group in self._groups:
-            models.append(environments.borrow_model(environments.model_path(tasks[group.rows[0]])))
-            programs = {
-                task: environments.program_class(task)(models[-1].model) for task in {tasks[row] for row in group.rows}
-            }
+            models.append(shared := environments.borrow_model(environments.model_path(tasks[group.rows[0]])))
+            kinds = {tasks[row] for row in group.rows}
+            programs = {task: environments.program_class(task)(shared.model) for task in kinds}
             for row in group.rows:
                 sources, program = simulation_table()[tasks[row]], programs[tasks[row]]
-                rows[row] = simulated_rows.SimulatedRow(sources, models[-1], program, rewards[row])
+                rows[row] = simulated_rows.SimulatedRow(sources, shared, program, rewards[row])
         self._rows = [rows[row] for row in range(len(tasks))]
         self._starts = EpisodeStarts([reward for reward in rewards if reward is not None]) if dense else None
         self._width = at.REWARD_WIDTH if dense else at.WIDTH

@@ -50,22 +50,16 @@ def gymnasium_episode(task: str, seed: int, actions: np.ndarray) -> dict[str, np
     """Run our actions (steps, 4) in a new environment of gymnasium-robotics without its time limit."""
     env = gymnasium.make(f"{IDS[task]}Dense-v4", max_episode_steps=1_000)
     now, goal = observed(task, env, env.reset(seed=seed)[0])
-    found: dict[str, list] = {
-        "observation": [np.concatenate((now, now, goal))],
-        "reward": [],
-        "success": [],
-        "state": [],
-    }
+    episode: dict[str, list] = {"observation": [[*now, *now, *goal]], "reward": [], "success": [], "state": []}
     for right, away, up, effort in actions:
-        told, reward, _, _, info = env.step(np.array([away, -right, up, -effort], dtype=actions.dtype))
+        state, reward, _, _, info = env.step(np.array([away, -right, up, -effort], dtype=actions.dtype))
         before = now
-        now, goal = observed(task, env, told)
-        found["observation"].append(np.concatenate((now, before, goal)))
-        found["reward"].append(reward)
-        found["success"].append(bool(info["is_success"]))
-        found["state"].append(physics(env.unwrapped.data))
+        now, goal = observed(task, env, state)
+        values = [*now, *before, *goal], reward, bool(info["is_success"]), physics(env.unwrapped.data)
+        for name, value in zip(episode, values, strict=True):
+            episode[name].append(value)
     env.close()
-    return {name: np.array(numbers) for name, numbers in found.items()}
+    return {name: np.array(numbers) for name, numbers in episode.items()}
 
 
 def physics(data) -> np.ndarray:
@@ -75,16 +69,19 @@ def physics(data) -> np.ndarray:
 
 def engine_episode(engine: FetchEngine, row: int, seed: int, actions: np.ndarray) -> dict[str, np.ndarray]:
     """Run actions in one row while the others rest."""
-    found: dict[str, list] = {"observation": [engine.reset([row], [seed])[0]], "reward": [], "success": [], "state": []}
+    episode: dict[str, list] = {
+        "observation": [engine.reset([row], [seed])[0]],
+        "reward": [],
+        "success": [],
+        "state": [],
+    }
     active = np.arange(len(engine._rows)) == row
-    given = np.zeros((len(active), 4), actions.dtype)
     for action in actions:
-        given[row] = action
-        result = engine.step(given, active)
+        result = engine.step(active[:, None] * action, active)
         for name in ("observation", "reward", "success"):
-            found[name].append(getattr(result, name)[row])
-        found["state"].append(physics(engine._rows[row].data))
-    return {name: np.array(numbers) for name, numbers in found.items()}
+            episode[name].append(getattr(result, name)[row])
+        episode["state"].append(physics(engine._rows[row].data))
+    return {name: np.array(numbers) for name, numbers in episode.items()}
 
 
 def scripted(task: str, seeds: range, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

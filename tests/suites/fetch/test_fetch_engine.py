@@ -37,37 +37,23 @@ def test_random_and_scripted_episodes_have_gymnasiums_bits(task, seed):
     assert_same(task, seed, random_actions(seed, 10).astype(np.float64) * 1.5)  # clipped in double precision
 
 
-def all_rows(tasks: list[str], threads: int) -> list[np.ndarray]:
-    """Run eight steps of all rows; a row's seed and actions depend on its task."""
-    engine = FetchEngine(tasks, num_threads=threads)
-    names = sorted(IDS)
-    seeds = [names.index(task) for task in tasks]
-    found = [engine.reset(range(len(tasks)), seeds)]
-    actions = [random_actions(seed, 8) for seed in seeds]
-    for step in range(8):
-        result = engine.step(np.stack([one[step] for one in actions]), np.ones(len(tasks), bool))
-        found += [result.observation, result.reward]
-    engine.close()
-    return found
-
-
 def test_results_depend_neither_on_threads_nor_on_the_order_of_rows():
-    tasks = sorted(IDS)
-    expected = all_rows(tasks, 1)
+    """Rows rest at random: they repeat their observation."""
+
+    def play(order: list[int], threads: int) -> list[np.ndarray]:
+        engine, rng = FetchEngine([sorted(IDS)[row] for row in order], num_threads=threads), np.random.default_rng(0)
+        arrays = [engine.reset(range(4), order)]
+        for _ in range(8):
+            action, active = rng.uniform(-1, 1, (4, 4)).astype(np.float32)[order], (rng.random(4) < 0.7)[order]
+            result = engine.step(action, active)
+            assert np.array_equal(result.observation[~active], arrays[-1][~active])
+            arrays.append(result.observation)
+        engine.close()
+        return arrays
+
+    expected = play([0, 1, 2, 3], 1)
     for order, threads in (([0, 1, 2, 3], 3), ([2, 0, 3, 1], 2)):
-        found = all_rows([tasks[row] for row in order], threads)
-        assert all(np.array_equal(a, b[order]) for a, b in zip(found, expected, strict=True))
-
-
-def test_inactive_rows_repeat_their_observation():
-    engine = FetchEngine(["fetch/push", "fetch/reach"], num_threads=1)
-    first = engine.reset([0, 1], [5, 6])
-    result = engine.step(np.ones((2, 4), np.float32), np.array([True, False]))
-    assert (result.observation[0] != first[0]).any()
-    assert np.array_equal(result.observation[1], first[1])
-    assert np.array_equal(result.observation[0, 11:22], first[0, :11])
-    assert np.array_equal(engine.reset([0], [5]), first[:1])
-    engine.close()
+        assert all(np.array_equal(a, b[order]) for a, b in zip(play(order, threads), expected, strict=True))
 
 
 def test_fault_stays_in_its_row():
@@ -93,13 +79,12 @@ def test_recording_shows_the_goal_and_changes_nothing():
     engine, other = (FetchEngine(["fetch/push"], num_threads=1) for _ in range(2))
     engine.reset([0], [0]), other.reset([0], [0])
     for action in random_actions(0, 5):
-        poses, model = engine.poses(0), engine.row_model(0)
-        assert poses.position.shape == (model.model.nbody, 3)
-        assert model.path.endswith("push.xml")
-        site = engine._rows[0].data.site("target0").xpos
-        assert np.array_equal(site, engine._rows[0].goal)
-        found, expected = (one.step(action[None], np.ones(1, bool)) for one in (engine, other))
-        assert np.array_equal(found.observation, expected.observation)
+        (path, model), data = engine._seen(0)
+        assert engine.poses(0).position.shape == (model.nbody, 3)
+        assert path.endswith("push.xml")
+        assert np.array_equal(data.site("target0").xpos, engine._rows[0].goal)
+        result, expected = (each.step(action[None], np.ones(1, bool)) for each in (engine, other))
+        assert np.array_equal(result.observation, expected.observation)
     engine.close(), other.close()
 
 

@@ -2,33 +2,17 @@
 
 import warnings
 from collections import defaultdict
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from metaworld.policies import ENV_POLICY_MAP
 from metaworld.utils import reward_utils
 
+from lw_torchrl.suites.metaworld import observation as at
 from lw_torchrl.suites.metaworld import reward_terms as terms
-from lw_torchrl.suites.metaworld.dense_reward import FORMULAS, LIFTS, DenseReward, EpisodeStarts
+from lw_torchrl.suites.metaworld.dense_reward import FORMULAS, LIFTS, DenseReward
 from lw_torchrl.suites.metaworld.environments import MetaWorldEngine
-from lw_torchrl.suites.metaworld.observation import (
-    CORNERS,
-    HAND,
-    JOINT,
-    LEFT_CLAW,
-    LEFT_PAD,
-    LEFT_TIP,
-    OBJECT,
-    PLACE,
-    QUATERNION,
-    RIGHT_CLAW,
-    RIGHT_PAD,
-    RIGHT_TIP,
-    SECOND,
-    Observer,
-    StateView,
-)
+from lw_torchrl.suites.metaworld.observation import Observer, StateView
 from lw_torchrl.suites.metaworld.simulated_rows import SimulatedRow
 from lw_torchrl.suites.metaworld.tables import reward_table, simulation_table
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
@@ -110,7 +94,7 @@ def construct_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.n
             thing[2] = start[2] + rng.choice([0.01, 0.015, 0.02, 0.05]) * rng.choice([0.99, 1.01])
         tips = near([thing, thing, beside(thing, 0, 0, 0.03), tips_start][rng.integers(4)])
         second = near([goal, thing, start][rng.integers(3)])
-        corners = sensors[CORNERS].reshape(-1, 3)
+        corners = sensors[at.CORNERS].reshape(-1, 3)
         place = [goal, second, second, thing][rng.integers(4)]
         if engine._starts.rewards[number].corners and rng.random() < 0.5:
             place = rng.uniform(corners.min(axis=0), corners.max(axis=0))
@@ -121,18 +105,18 @@ def construct_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.n
         world = [*view.find("body world"), *view.find("quaternion of body world")]
         ideal = [[0.707, 0, 0, 0.707], [1, 0, 0, 0]][rng.integers(2)]
         invented = [
-            (OBJECT, thing - row.sources.offset),
-            (SECOND, second - row.sources.second_offset),
-            (PLACE, near(place)),
-            (HAND, near(beside(tips, 0, 0, 0.04))),
-            (RIGHT_TIP, beside(tips, 0, -0.02, 0)),
-            (LEFT_TIP, beside(tips, 0, 0.02, 0)),
-            (RIGHT_PAD, beside(tips, 0, -pads[0], 0)),
-            (LEFT_PAD, beside(tips, 0, pads[1], 0)),
-            (RIGHT_CLAW, beside(tips, 0, opening, 0)),
-            (LEFT_CLAW, tips),
-            (JOINT, rng.choice([0.1, rng.uniform(-0.1, 0.1), rng.uniform(-2, 1.6)])),
-            (QUATERNION, ideal + rng.choice([0.0, 0.01, 0.2]) * rng.normal(size=4)),
+            (at.OBJECT, thing - row.sources.offset),
+            (at.SECOND, second - row.sources.second_offset),
+            (at.PLACE, near(place)),
+            (at.HAND, near(beside(tips, 0, 0, 0.04))),
+            (at.RIGHT_TIP, beside(tips, 0, -0.02, 0)),
+            (at.LEFT_TIP, beside(tips, 0, 0.02, 0)),
+            (at.RIGHT_PAD, beside(tips, 0, -pads[0], 0)),
+            (at.LEFT_PAD, beside(tips, 0, pads[1], 0)),
+            (at.RIGHT_CLAW, beside(tips, 0, opening, 0)),
+            (at.LEFT_CLAW, tips),
+            (at.JOINT, rng.choice([0.1, rng.uniform(-0.1, 0.1), rng.uniform(-2, 1.6)])),
+            (at.QUATERNION, ideal + rng.choice([0.0, 0.01, 0.2]) * rng.normal(size=4)),
         ]
         for columns, value in invented:
             index = row._sensor_index[columns]
@@ -239,9 +223,3 @@ def test_table_has_a_reward_for_every_task_and_uses_every_formula():
     assert list(table) == TASKS
     assert {reward.formula for reward in table.values()} == set(FORMULAS)
     assert {reward.lift for reward in table.values()} - {None} == set(LIFTS)
-
-
-def test_missing_attribute_of_metaworld_raises():
-    starts = EpisodeStarts([reward_table()["window-open"]])
-    with pytest.raises(AttributeError, match="window_handle_pos_init"):
-        starts.begin(0, SimpleNamespace(obj_init_pos=np.zeros(3), init_tcp=np.zeros(3)))
