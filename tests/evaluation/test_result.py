@@ -1,15 +1,18 @@
 """EvaluationResult: statistics, tables, failures, and a file that is whole or refused."""
 
 import json
+import tomllib
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import reduce
 from hashlib import sha256
+from operator import getitem
+from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mutations import mutated
 
 import lw_torchrl
 from lw_torchrl._util.reproducibility import package_versions
@@ -21,23 +24,22 @@ CONFIG |= {"stop_at_success": False, "reward": "sparse", "max_steps": 500}
 
 
 def make_result():
-    episodes = [
-        EpisodeResult("push", 0, True, 10, False, 4.0, torch.zeros(500, 4)),
-        EpisodeResult("push", 1, True, 21, True, 480.0),
-        EpisodeResult("push", 2, False, None, False, 0.0),
-        EpisodeResult("reach", 0, True, 1, True, 500.0),
-        EpisodeResult("reach", 1, True, 2, True, 499.0),
-        EpisodeResult("reach", 2, True, 6, True, 495.0),
-        *(EpisodeResult("sweep", k, False, None, False, 0.0) for k in range(3)),
-    ]
-    return EvaluationResult(CONFIG, tuple(episodes))
+    push = [(10, False, 4.0, torch.zeros(500, 4)), (21, True, 480.0), (None, False, 0.0)]
+    reach = [(1, True, 500.0), (2, True, 499.0), (6, True, 495.0)]
+    outcomes = {"push": push, "reach": reach, "sweep": 3 * [(None, False, 0.0)]}
+    return EvaluationResult(CONFIG, episodes(outcomes))
+
+
+def episodes(outcomes):
+    """Return episodes from the first success, the success at the end and the return of each, by task."""
+    numbered = [(task, k, *outcome) for task, listed in outcomes.items() for k, outcome in enumerate(listed)]
+    return tuple(EpisodeResult(task, k, first is not None, first, *rest) for task, k, first, *rest in numbered)
 
 
 def stopped():
     """A result of an evaluation with stop_at_success=True."""
-    episodes = [EpisodeResult("reach", 0, True, 9, None, None), EpisodeResult("reach", 1, False, None, None, None)]
     config = {**CONFIG, "tasks": ["reach"], "episodes_per_task": 2, "stop_at_success": True}
-    return EvaluationResult(config, tuple(episodes))
+    return EvaluationResult(config, episodes({"reach": [(9, None, None), (None, None, None)]}))
 
 
 WRONG = Finding("wrong answers", {"step": 2, "condition": "the gripper is open", "states": 40, "of": 500, "first": 31})
@@ -53,14 +55,10 @@ FAILURES = (
 
 def attributed(failures=FAILURES):
     """A result with the causes of its failures."""
-    episodes = [
-        EpisodeResult("push", 0, False, None, False, 0.0),
-        EpisodeResult("push", 1, False, None, False, 0.0),
-        EpisodeResult("reach", 0, True, 4, True, 496.0),
-        EpisodeResult("reach", 1, False, None, False, 0.0),
-    ]
+    failed = (None, False, 0.0)
     config = {**CONFIG, "tasks": ["push", "reach"], "episodes_per_task": 2}
-    return EvaluationResult(config, tuple(episodes), failures=failures)
+    outcomes = {"push": [failed, failed], "reach": [(4, True, 496.0), failed]}
+    return EvaluationResult(config, episodes(outcomes), failures=failures)
 
 
 # ---- statistics, tables and figures
@@ -141,68 +139,22 @@ def test_the_file_is_plain_json(tmp_path):
     assert content["episodes"][0] == {"task": "push", "episode": 0, **outcome}
 
 
-def change(**entries):
-    return lambda content: content.update(entries)
+DAMAGE = tomllib.loads(Path(__file__).with_name("damaged_results.toml").read_text("utf-8"))
 
 
-def edit(number, **entries):
-    return lambda content: content["episodes"][number].update(entries)
-
-
-def configure(**entries):
-    return lambda content: content["config"].update(entries)
-
-
-DAMAGE = {
-    "success is 5": edit(0, success=5),
-    "success is 1": edit(0, success=1),
-    "an episode twice": edit(1, episode=0),
-    "a whole episode twice": lambda content: content["episodes"].append(content["episodes"][0]),
-    "a missing episode": lambda content: content["episodes"].pop(),
-    "no episodes": change(episodes=[]),
-    "no tasks and no episodes": lambda content: (content["config"].update(tasks=[]), content.update(episodes=[])),
-    "a negative episode": edit(0, episode=-1),
-    "episode is true": edit(1, episode=True),
-    "an episode of another task": edit(0, task="drawer-open"),
-    "task is a list": edit(0, task=["push"]),
-    "first success is 0": edit(0, first_success=0),
-    "a first success after the end": edit(0, first_success=501),
-    "a first success without success": edit(2, first_success=7),
-    "a success without its first": edit(0, first_success=None),
-    "first success is a float": edit(0, first_success=10.0),
-    "a success only at the end": edit(2, success_at_end=True),
-    "success at the end is a string": edit(0, success_at_end="yes"),
-    "return is a string": edit(0, episode_return="4.0"),
-    "a return of 400 digits": edit(0, episode_return=10**400),
-    "return is nan": edit(0, episode_return=float("nan")),
-    "a task twice in config": lambda content: content["config"]["tasks"].append("push"),
-    "tasks is a string": configure(tasks="push"),
-    "tasks are numbers": configure(tasks=[1, 2]),
-    "other tasks in success_once": lambda content: content["success_once"].pop("push"),
-    "another number of episodes": configure(episodes_per_task=4),
-    "number of episodes is true": configure(episodes_per_task=True),
-    "seed is a string": configure(seed="1"),
-    "negative noise": configure(noise_scale=-0.1),
-    "max_steps is null": configure(max_steps=None),
-    "stop_at_success is a number": configure(stop_at_success=0),
-    "no seed": lambda content: content["config"].pop("seed"),
-    "origin is a string": change(origin="mine"),
-    "version is a list": change(version=[[1]]),
-    "another format": change(format="minari"),
-    "another version": change(version=2),
-    "no config": lambda content: content.pop("config"),
-    "an unknown entry": lambda content: content["episodes"][0].update(colour="red"),
-    "a missing entry": lambda content: content["episodes"][0].pop("success"),
-    "episodes are numbers": change(episodes=[1, 2]),
-    "config is a list": change(config=[]),
-    "a task without episodes": lambda content: content["config"]["tasks"].append("drawer-open"),
-}
-
-
-def damaged_file(path, result, damage):
+def damaged_file(path, result, changes):
+    """Save a result in which entries have other values, as JSON, or are removed."""
     result.save(path)
     content = json.loads(path.read_text())
-    damage(content)
+    for place, value in changes.items():
+        *parents, key = [int(name) if name.isdigit() else name for name in place.split()]
+        node = reduce(getitem, parents, content)
+        if isinstance(node, list):
+            node[key : key + 1] = [json.loads(value)] if value else []
+        elif value:
+            node[key] = json.loads(value)
+        else:
+            node.pop(key, None)
     path.write_text(json.dumps(content))
     return path
 
@@ -219,7 +171,7 @@ def test_a_damaged_file_is_refused_and_left_unchanged(tmp_path, name):
 @pytest.mark.parametrize("failures", [{}, [3], [{}], FAILURES[:2], (*FAILURES, FAILURES[0])])
 def test_there_must_be_one_failure_for_each_failed_episode(tmp_path, failures):
     content = [each.to_json() for each in failures] if isinstance(failures, tuple) else failures
-    path = damaged_file(tmp_path / "results.json", attributed(()), change(failures=content))
+    path = damaged_file(tmp_path / "results.json", attributed(()), {"failures": json.dumps(content)})
     with pytest.raises(ValueError, match=r"[Ff]ailure"):
         EvaluationResult.load(path)
 
@@ -228,9 +180,19 @@ def test_there_must_be_one_failure_for_each_failed_episode(tmp_path, failures):
     "finding", [{"kind": "other", "values": {}}, {"kind": "active step", "values": {"step": 0}}, 3]
 )
 def test_a_finding_without_its_values_is_refused(tmp_path, finding):
-    change_finding = lambda content: content["failures"][1].update(finding=finding)  # noqa: E731
+    change = {"failures 1 finding": json.dumps(finding)}
     with pytest.raises(ValueError, match=r"[Ff]inding|kind"):
-        EvaluationResult.load(damaged_file(tmp_path / "results.json", attributed(), change_finding))
+        EvaluationResult.load(damaged_file(tmp_path / "results.json", attributed(), change))
+
+
+ODD = [0, 1, -1, 2, 0.5, -0.0, 1e300, 2**31, 2**63, -(2**63), 10**400, None, True, False, "", "5", "reach", "raech"]
+ODD += ["x" * 5000, [], [[[[[[]]]]]], [1, 2, 3], ["reach"], ["reach", "reach"], [None], [True], {}, {"a": {"b": {}}}]
+
+
+def places_in(value, path=""):
+    """Return the names of all entries inside a JSON value, as :func:`damaged_file` reads them."""
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [place for key, part in inside for place in (f"{path}{key}", *places_in(part, f"{path}{key} "))]
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -238,7 +200,11 @@ def test_a_finding_without_its_values_is_refused(tmp_path, finding):
 def test_a_mutated_file_is_refused_or_consistent(tmp_path, data):
     path = tmp_path / "results.json"
     stopped().save(path)
-    path.write_text(json.dumps(data.draw(mutated(json.loads(path.read_text())))))
+    places = [*places_in(json.loads(path.read_text())), "episodes 2", "episodes 0 more"]
+    changed = data.draw(st.lists(st.sampled_from(places), min_size=1, max_size=3, unique=True))
+    # Change inner entries first, because an outer one may replace or remove them.
+    changed.sort(key=lambda place: -place.count(" "))
+    damaged_file(path, stopped(), {place: data.draw(st.sampled_from(["", *map(json.dumps, ODD)])) for place in changed})
     try:
         result = EvaluationResult.load(path)
     except ValueError:
@@ -281,7 +247,7 @@ def test_the_file_records_its_origin(tmp_path):
     assert loaded.origin["checkpoint"] == {"path": str(checkpoint), "sha256": sha256(b"weights").hexdigest()}
     assert loaded.origin["plans"] == "0123abcd"
     assert loaded == make_result(), "the origin is not compared"
-    damaged_file(tmp_path / "old.json", make_result(), lambda content: content.pop("origin"))
+    damaged_file(tmp_path / "old.json", make_result(), {"origin": ""})
     assert EvaluationResult.load(tmp_path / "old.json").origin == {}
     with pytest.raises(FileNotFoundError, match="nowhere"):
         make_result().save(tmp_path / "other.json", checkpoint=tmp_path / "nowhere.safetensors")

@@ -19,14 +19,8 @@ PARTS = ("training", "states", "queries", "tasks")
 def replay(tmp_path_factory):
     root = tmp_path_factory.mktemp("states")
     for who in ("scripted", "random"):
-        lw.collect_demonstrations(
-            ["drawer-open", "push", "reach"],
-            episodes_per_task=8,
-            root=root / who,
-            policy=who,
-            max_steps=50,
-            progress=False,
-        )
+        options = {"episodes_per_task": 8, "max_steps": 50, "progress": False}
+        lw.collect_demonstrations(["drawer-open", "push", "reach"], root=root / who, policy=who, **options)
     return lw.LanguageWorldExperienceReplay([root / "scripted", root / "random"], label="executed")
 
 
@@ -51,8 +45,7 @@ def pairs_of(part):
 
 def test_held_out_data_are_not_in_the_training_data(replay):
     config = lw.training.QueryEvaluatorConfig(held_out_tasks=("reach",), held_out_pairs=0.3, seed=3)
-    data = lw.training.LabelledQueries(replay, config)
-    parts = data.parts
+    parts = (data := lw.training.LabelledQueries(replay, config)).parts
     assert (data.tasks, data.held_out_tasks) == (("drawer-open", "push"), ("reach",))
     assert all(parts[part] for part in PARTS)
     assert {queries.task.name for queries in parts["tasks"]} == {"reach"}

@@ -1,6 +1,7 @@
 """A checkpoint has one writer, and the checkpoint of another training is refused and left unchanged."""
 
 import importlib.metadata
+from dataclasses import replace
 
 import pytest
 import torch
@@ -37,13 +38,11 @@ def assert_refused(path, message, make):
     assert path.stem in str(caught.value)
 
 
-SMALLER = {task: plan for task, plan in PLANS.items() if task in ("push", "reach")}
 ACTORS = {
     r"width \(16, now 32\)": lambda: make_actor(1, width=32),
-    r"depth \(1, now 2\)": lambda: make_actor(1, depth=2),
     r"latent_size \(4, now 5\)": lambda: make_actor(1, latent_size=5),
     r"kind \('differences', now 'raw'\)": lambda: make_actor(1, kind="raw"),
-    "plans;": lambda: make_actor(plans=SMALLER),
+    "plans;": lambda: make_actor(plans={task: PLANS[task] for task in ("push", "reach")}),
     "class": make_descriptor_actor,
 }
 
@@ -57,21 +56,10 @@ def test_a_checkpoint_of_another_architecture_is_refused(demos, checkpoint, diff
     assert all(torch.equal(value, before[name]) for name, value in actor.state_dict().items())
 
 
-OTHER_VALUES = {
-    "steps": 13,
-    "batch_size": 6,
-    "learning_rate": 1e-3,
-    "loss_function": "l1",
-    "seed": 1,
-    "weight_decay": 0.0,
-}
-
-
-@pytest.mark.parametrize("name", OTHER_VALUES)
-def test_a_checkpoint_of_another_configuration_is_refused(demos, checkpoint, name):
-    config = lw.BehavioralCloningConfig(**{**vars(CONFIG), name: OTHER_VALUES[name]})
-    message = f"a different configuration: its training differs in {name} "
-    assert_refused(checkpoint, message, lambda: make_trainer(demos, checkpoint, config=config))
+def test_a_checkpoint_of_another_configuration_is_refused(demos, checkpoint):
+    values = dict(batch_size=6, learning_rate=1e-3, loss_function="l1", seed=1, steps=13, weight_decay=0.0)
+    message = "a different configuration: its training differs in " + ".* ".join(values)
+    assert_refused(checkpoint, message, lambda: make_trainer(demos, checkpoint, config=replace(CONFIG, **values)))
 
 
 def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
@@ -84,7 +72,6 @@ def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
 @pytest.mark.parametrize(
     ("change", "difference"),
     [
-        (dict(label="executed"), "label"),
         (dict(label="unclipped"), "label"),
         (dict(after_success=0), "rows"),
         (dict(sampler=RandomSampler), "sampler"),
@@ -108,9 +95,8 @@ def test_a_checkpoint_of_other_samples_is_refused(long_demos, tmp_path, change, 
     assert_refused(path, f"a different configuration: its replay differs in {difference}", lambda: trainer(**change))
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not quite", b"years of work\n"])
-def test_a_file_of_another_program_is_refused(demos, tmp_path, content):
-    path, state = tmp_path / "thesis.tex", tmp_path / "thesis.training.tex"
+def test_a_file_of_another_program_is_refused(demos, tmp_path):
+    path, state, content = tmp_path / "thesis.tex", tmp_path / "thesis.training.tex", b"years of work\n"
     path.write_bytes(content)
     assert_refused(path, "exists, but its training state .* does not", lambda: make_trainer(demos, path))
     state.write_bytes(content)

@@ -4,6 +4,7 @@ import math
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTraine
 from lw_torchrl.transforms import RandomYaw
 
 
-@pytest.mark.parametrize("stops", [[5], [7], [11], [6, 6], [3, 8, 11]])
+@pytest.mark.parametrize("stops", [[5], [6, 6], [3, 8, 11]])
 def test_training_interrupted_at_any_step_resumes_bit_for_bit(demos, uninterrupted, tmp_path, stops):
     path = tmp_path / "runs" / "checkpoint.safetensors"
     for stop in stops:
@@ -59,8 +60,7 @@ def test_torchrls_samplers_resume(demos, tmp_path, sampler):
 
 
 def test_an_integer_learning_rate_resumes(demos, tmp_path):
-    config = BehavioralCloningConfig(steps=12, batch_size=8, checkpoint_every=5, learning_rate=1)
-    path = tmp_path / "checkpoint.safetensors"
+    config, path = replace(CONFIG, learning_rate=1), tmp_path / "checkpoint.safetensors"
     with pytest.raises(KeyboardInterrupt):
         make_trainer(demos, path, config=config, stop_at=7).train()
     assert make_trainer(demos, path, config=config).steps == 5
@@ -93,10 +93,7 @@ def test_checkpoints_are_written_on_schedule_as_two_files(demos, tmp_path, monke
     monkeypatch.setattr(BehavioralCloningTrainer, "save", lambda self: (saved.append(self.steps), save(self)))
     make_trainer(demos, tmp_path / "checkpoint.safetensors").train()
     assert saved == [5, 10, 12]
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "checkpoint.safetensors",
-        "checkpoint.training.safetensors",
-    ]
+    assert {path.name for path in tmp_path.iterdir()} == {"checkpoint.safetensors", "checkpoint.training.safetensors"}
 
 
 def test_training_in_parts_equals_training_at_once(demos, uninterrupted, tmp_path):
