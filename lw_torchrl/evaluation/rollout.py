@@ -126,17 +126,15 @@ def _written(env: EnvBase) -> set[NestedKey]:
 
 
 def _checked(policy: Acts, env: EnvBase, keys: Iterable[NestedKey]) -> Acts:
-    """Wrap ``policy`` to check every action and, at the first call, that policy or environment writes each key."""
+    """Wrap ``policy`` to check every action, and that policy or environment writes each key."""
     by_env, size = _written(env), env.action_spec.shape[-1]
-    unseen = [key for key in keys if key not in by_env]
+    others = [key for key in keys if key not in by_env]
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = policy(tensordict)
-        read_action(tensordict, size)
-        while unseen:
-            if (key := unseen.pop()) not in tensordict.keys(True):
-                written = tensordict.exclude("_step").keys(True, True)
-                raise unknown_name("also_record", key, [*dict.fromkeys([*written, *sorted(by_env, key=str)])])
+        read_action(tensordict := policy(tensordict), size)
+        for key in others:
+            if key not in tensordict.keys(True):
+                raise unknown_name("also_record", key, {*tensordict.exclude("_step").keys(True, True), *by_env})
         return tensordict
 
     return run

@@ -64,16 +64,15 @@ def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int
             group["lr"] = rate
 
 
-def _check_loss(losses: Tensor, step: int, config: Any) -> None:
+def _check_loss(losses: Tensor, step: int) -> None:
     """Raise :class:`ValueError` if a loss, () for one actor or (M,) for M actors, is not finite."""
-    if losses.isfinite().all():
-        return
-    number = int((~losses.reshape(-1).isfinite()).nonzero()[0])
-    actor = f" of actor {number}" if losses.ndim else ""
-    raise ValueError(
-        f"the loss{actor} is {losses.reshape(-1)[number].item()} at step {step}: the demonstrations hold NaN, or the "
-        f"learning rate {config.learning_rate} is too high"
-    )
+    for number, loss in enumerate(losses.reshape(-1).tolist()):
+        if not math.isfinite(loss):
+            where, cause = (
+                f" of actor {number}" * losses.ndim,
+                "the demonstrations hold NaN, or learning_rate is too high",
+            )
+            raise ValueError(f"the loss{where} is {loss} at step {step}: {cause}")
 
 
 class _Interrupt:
@@ -242,7 +241,7 @@ class Training:
         terms = [value for name, value in values.items() if name.startswith("loss")]
         values["loss"] = loss = terms[0] if len(terms) == 1 else torch.stack(terms).sum(0)
         if self.device == CPU:  # on a GPU, reading the loss would wait for the device
-            _check_loss(loss.detach(), self.steps, self.config)
+            _check_loss(loss.detach(), self.steps)
         self.optimizer.zero_grad()
         loss.sum().backward()
         self.clip_gradients()
@@ -339,7 +338,7 @@ class Training:
         read = {name: torch.stack([values[name] for values in self._values]).cpu() for name in names}
         self.last = {name: value.double().mean().item() for name, value in read.items()}
         for step, loss in enumerate(read["loss"], self.steps - len(self._values)):
-            _check_loss(loss, step, self.config)
+            _check_loss(loss, step)
         return read["loss"]
 
     def save(self) -> None:

@@ -21,6 +21,7 @@ from lw_torchrl.transforms.qaf import plan_program
 
 TASK, SEED, STEPS = "drawer-open", 7, 80
 PLANS = lw.Plans({TASK: lw.load_plans("MT10")[TASK]})
+PROGRAM = plan_program(PLANS)
 PAIRS = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
 ALIGNED = "almost vertically aligned with the drawer handle"
 CONDITIONS = (
@@ -65,7 +66,7 @@ class WrongEvaluator(lw.QueryEvaluator):
     """The same wrong answers, by an evaluator inside a policy."""
 
     def logits(self, observation, task_id):
-        answers = plan_program(self.plans)(observation, task_id)
+        answers = PROGRAM(observation, task_id)
         answers[..., 1] ^= True
         return 10.0 * answers.float() - 5.0
 
@@ -265,7 +266,7 @@ def test_a_policy_that_cannot_follow_the_reference_causes_a_warning():
         def with_plans(self, plans):
             raise ValueError("the plans are fixed")
 
-    with pytest.warns(UserWarning, match="the policy cannot follow the reference .*the plans are fixed"):
+    with pytest.warns(UserWarning, match="the policy cannot follow the reference.*the plans are fixed"):
         [failure] = evaluated(Fixed(faulty_plans()), reference=REFERENCE, max_steps=20).failures
     assert "plan" not in failure.counterfactuals
 

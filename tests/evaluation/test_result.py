@@ -1,6 +1,8 @@
-"""EvaluationResult: statistics, tables, failures, and a file that is whole or refused."""
+"""EvaluationResult: statistics, tables, failures, figures, and a file that is whole or refused."""
 
 import json
+import struct
+import sys
 import tomllib
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -16,8 +18,9 @@ from hypothesis import strategies as st
 
 import lw_torchrl
 from lw_torchrl._util.reproducibility import package_versions
-from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, Failure, plot_failures
+from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, Failure, plot_failures, plot_success
 from lw_torchrl.evaluation.diagnose.failure import Finding
+from lw_torchrl.evaluation.result import wilson_interval
 
 CONFIG = {"tasks": ["push", "reach", "sweep"], "episodes_per_task": 3, "seed": 1, "noise_scale": 0.1}
 CONFIG |= {"stop_at_success": False, "reward": "sparse", "max_steps": 500}
@@ -109,6 +112,51 @@ def test_the_failure_figure_has_a_bar_for_each_task_that_failed(tmp_path):
         plot_failures(attributed(), tmp_path / "failures.txt")
 
 
+@given(st.integers(1, 1000), st.data())
+def test_the_interval_contains_the_rate_and_is_symmetric(trials, data):
+    successes = data.draw(st.integers(0, trials))
+    low, high = wilson_interval(successes, trials)
+    assert 0 <= low <= successes / trials + 1e-12
+    assert successes / trials - 1e-12 <= high <= 1
+    assert high - low > 0
+    mirrored = wilson_interval(trials - successes, trials)
+    assert (1 - high, 1 - low) == pytest.approx(mirrored, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "expected"),
+    [(8, 10, (0.4902, 0.9433)), (0, 20, (0.0, 0.1611)), (50, 100, (0.4038, 0.5962))],
+)
+def test_the_interval_equals_published_values(successes, trials, expected):
+    assert wilson_interval(successes, trials) == pytest.approx(expected, abs=2e-4)
+
+
+def test_figures_are_written_as_png_and_pdf(tmp_path):
+    path = tmp_path / "runs" / "success.png"
+    plot_success(make_result(), path, title="a title")
+    content = path.read_bytes()
+    assert content[:8] == b"\x89PNG\r\n\x1a\n"
+    assert content[-8:-4] == b"IEND"
+    width, height = struct.unpack(">II", content[16:24])
+    assert min(width / 4, height) > 150
+    plot_success(make_result(), tmp_path / "success.pdf")
+    assert (tmp_path / "success.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_the_bars_are_the_rates_best_on_top():
+    axes = plot_success(make_result()).axes[0]
+    assert [bar.get_width() for bar in axes.patches] == pytest.approx([0.0, 2 / 3, 1.0])
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["sweep", "push", "reach"]
+    assert "0.556" in axes.get_title()
+    assert "of 3;" in axes.get_xlabel()
+
+
+def test_no_window_is_opened_and_no_backend_chosen(monkeypatch):
+    monkeypatch.delitem(sys.modules, "matplotlib.pyplot", raising=False)
+    plot_success(make_result())
+    assert "matplotlib.pyplot" not in sys.modules
+
+
 # ---- files
 
 
@@ -195,12 +243,16 @@ def places_in(value, path=""):
     return [place for key, part in inside for place in (f"{path}{key}", *places_in(part, f"{path}{key} "))]
 
 
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    path = damaged_file(tmp_path_factory.mktemp("places") / "results.json", stopped(), {})
+    return [*places_in(json.loads(path.read_text())), "episodes 2", "episodes 0 more"]
+
+
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_a_mutated_file_is_refused_or_consistent(tmp_path, data):
+def test_a_mutated_file_is_refused_or_consistent(tmp_path, places, data):
     path = tmp_path / "results.json"
-    stopped().save(path)
-    places = [*places_in(json.loads(path.read_text())), "episodes 2", "episodes 0 more"]
     changed = data.draw(st.lists(st.sampled_from(places), min_size=1, max_size=3, unique=True))
     # Change inner entries first, because an outer one may replace or remove them.
     changed.sort(key=lambda place: -place.count(" "))

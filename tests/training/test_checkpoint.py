@@ -26,7 +26,6 @@ PLANS = lw.load_plans("MT10")
 
 
 def small(plans=PLANS, **options):
-    """A small actor; the same for :class:`lw.modules.DescriptorConditionedActor`'s tasks."""
     parts = {"skill_encoder": SkillEncoder(4, width=8), "decoder": MLPDecoder(width=16, depth=1)}
     return lw.PlanConditionedActor(plans, **{**parts, **options})
 
@@ -36,16 +35,10 @@ def count_vowels(texts):
 
 
 def make_rows(plans=PLANS, rows=40, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return TensorDict(
-        {
-            "observation": torch.rand(rows, 39, generator=generator),
-            "task_id": torch.tensor([lw.task_id(task) for task in ("push", "reach")]).repeat(rows // 2),
-            "qaf": torch.rand(rows, plans.num_steps, generator=generator) > 0.5,
-            "action": torch.rand(rows, 4, generator=generator) - 0.5,
-        },
-        [rows],
-    )
+    torch.manual_seed(seed)
+    task_id = torch.tensor([lw.task_id(task) for task in ("push", "reach")]).repeat(rows // 2)
+    columns = {"observation": torch.rand(rows, 39), "task_id": task_id, "qaf": torch.rand(rows, plans.num_steps) > 0.5}
+    return TensorDict({**columns, "action": torch.rand(rows, 4) - 0.5}, [rows])
 
 
 def train(actor, path, plans=PLANS):
@@ -163,11 +156,10 @@ def test_any_safetensors_reader_reads_the_weights(saved):
 def test_the_description_records_architecture_training_and_versions(saved, path):
     description = read_description(saved[0])
     assert description["actor"] == describe(saved[1])
-    assert description["actor"]["class"] == "PlanConditionedActor"
     assert (description["training"]["steps"], description["data"]) == (5, None)
     lw.save_actor(saved[1], path, note={"mine": [1, 2]})
-    assert read_description(path)["note"] == {"mine": [1, 2]}
-    assert read_description(path)["versions"] == package_versions()
+    description = read_description(path)
+    assert (description["note"], description["versions"]) == ({"mine": [1, 2]}, package_versions())
 
 
 # ---- refused before it is written
@@ -186,32 +178,18 @@ def test_an_actor_that_cannot_be_saved_is_refused_before_training(tmp_path, path
     assert not list(tmp_path.iterdir())
 
 
-def pruned(actor):
-    prune.random_unstructured(actor.decoder.network[0], "weight", 0.5)
-    return actor
+UNSAVED = {
+    "got torch.float64": lambda network: network.double(),
+    "module.decoder.network.0.weight": lambda network: prune.random_unstructured(network[0], "weight", 0.5),
+    r"of shape \(32, .*, got torch.float32 of shape \(16, ": lambda network: network._options.update(width=32),
+    "decoder.network.0.bias must be finite": lambda network: nn.init.constant_(network[0].bias, float("inf")),
+}
 
 
-def reconfigured(actor):
-    actor.decoder.network._options["width"] = 32
-    return actor
-
-
-def not_finite(actor):
-    nn.init.constant_(actor.decoder.network[0].bias, float("inf"))
-    return actor
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lw.PlanConditionedActor.double, "got torch.float64"),
-        (pruned, "module.decoder.network.0.weight"),
-        (reconfigured, r"of shape \(32, .*, got torch.float32 of shape \(16, "),
-        (not_finite, "decoder.network.0.bias must be finite"),
-    ],
-)
-def test_an_actor_that_could_not_be_loaded_is_not_saved(tmp_path, path, change, message):
-    actor = change(small())
+@pytest.mark.parametrize("message", UNSAVED)
+def test_an_actor_that_could_not_be_loaded_is_not_saved(tmp_path, path, message):
+    actor = small()
+    UNSAVED[message](actor.decoder.network)
     for write in (lw.save_actor, train):
         with pytest.raises(ValueError, match=f"actor cannot be saved, .*{message}"):
             write(actor, path)
@@ -284,8 +262,5 @@ def test_a_flipped_bit_is_detected(path):
     lw.save_actor(small(), path)
     content = path.read_bytes()
     for place in range(len(content) // 3, len(content), len(content) // 7):
-        damaged = bytearray(content)
-        damaged[place] ^= 0x10
-        path.write_bytes(damaged)
-        with pytest.raises(ValueError, match="is corrupted"):
-            lw.load_actor(path)
+        path.write_bytes(content[:place] + bytes([content[place] ^ 0x10]) + content[place + 1 :])
+        assert_refused(path, "is corrupted")

@@ -247,8 +247,8 @@ def test_a_checkpoint_of_another_training_is_refused(demos, checkpoint, change, 
         OfflineTrainer(loss, replay, change.get("config", CONFIG), checkpoint=checkpoint, progress=False)
 
 
-def assert_refused(loss, replay, message, error=ValueError):
-    with pytest.raises(error, match=message):
+def assert_refused(loss, replay, message):
+    with pytest.raises(ValueError, match=message):
         OfflineTrainer(loss, replay, CONFIG, progress=False)
 
 
@@ -287,6 +287,3 @@ def test_unsuitable_losses_are_refused(demos):
     unreduced = make_sac(SACLoss, 0.0, reduction="none", scalar_output_mode="exclude")
     assert_refused(unreduced, replay, "loss .*reduction='none'")
     assert_refused(make_sac(CQLLoss, 0.0, with_lagrange=True), replay, "loss: with_lagrange")
-    assert_refused(torch.nn.Sequential(make_loss("td3-bc")), replay, "loss must be a LossModule", TypeError)
-    made = LOSSES["iql"](0.0).make_value_estimator(gamma=GAMMA)  # which is None
-    assert_refused(made, replay, "got NoneType; .*make_value_estimator", TypeError)

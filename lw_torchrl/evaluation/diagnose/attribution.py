@@ -26,6 +26,7 @@ from lw_torchrl.evaluation.diagnose.states import (
     departures,
     last_active_step,
 )
+from lw_torchrl.evaluation.rollout import actor_plans
 from lw_torchrl.language.canonical import explain_canonical, fallback_plan
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
@@ -109,8 +110,7 @@ def attribute_failures(
     Source: a plan's conditions, skills and skill execution are separate in the policy, so each can be replaced.
     """
     answered = as_plans(plans)
-    if (own := plans_of(actor)) is not None and (other := answered.differences(own)):
-        raise ValueError(f"plans differ from the actor's plans for {', '.join(other)}; pass the actor's plans")
+    actor_plans(actor, answered)  # raises an error if the plans differ from the actor's
     failed = _failed(rollouts, answered)
     if not failed:
         return []
