@@ -102,11 +102,9 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
     figure = new_figure(8.0, 1.9 + 0.27 * len(tasks) + 0.1 * len({cause for row in counts.values() for cause in row}))
     axes = figure.subplots()
     left = np.zeros(len(tasks))
-    for cause, meaning in CAUSES.items():
+    for cause in [cause for cause in CAUSES if any(row[cause] for row in counts.values())]:
         numbers = [counts[task][cause] for task in tasks]
-        if not any(numbers):
-            continue
-        label = f"{cause}: {meaning} ({sum(numbers)})"
+        label = f"{cause}: {CAUSES[cause]} ({sum(numbers)})"
         bars = axes.barh(tasks, numbers, left=left, color=CAUSE_COLORS[cause], label=label, height=0.7)
         axes.bar_label(bars, [str(n) if n else "" for n in numbers], label_type="center", color="white", fontsize=8)
         left = left + numbers

@@ -74,10 +74,9 @@ def rollout(
         chosen = [tasks[task] for task in part]
         base = LanguageWorldEnv(chosen, num_envs=num_rows(part, ROWS, num_envs), strict=True, **env_options)
         env = _with_transforms(base, first, transform_of(actor, plans), _transform_of_evaluator(evaluator))
-        more = [unravel_key(key) for key in optional]
-        keys_of_parts = {unravel_key(key) for each in (actor, evaluator) for key in getattr(each, "out_keys", ())}
-        written = keys_of_parts | _written(env)
-        recorded = list(dict.fromkeys([*map(unravel_key, keys), *(key for key in more if key in written)]))
+        written = {unravel_key(key) for each in (actor, evaluator) for key in getattr(each, "out_keys", ())}
+        more = [key for key in map(unravel_key, optional) if key in written | _written(env)]
+        recorded = list(dict.fromkeys([*map(unravel_key, keys), *more]))
         acting = actor if wrap is None else wrap(actor)
         if evaluator is not None and not isinstance(evaluator, Transform):
             acting = EvaluatorInFront(evaluator, acting)

@@ -210,7 +210,8 @@ def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
             raise ValueError("in_keys or out_keys were changed after construction; pass them to the constructor")
         _copy_tensors(module.state_dict(), again.state_dict(keep_vars=True))
     except Exception as error:
-        raise ValueError(f"{kind} cannot be saved, because it could not be loaded ({_one_line(error)})") from error
+        reason = f"its description does not rebuild it ({_one_line(error)})"
+        raise ValueError(f"{kind} cannot be saved, because {reason}") from error
 
 
 def policy_file(path: AnyPath) -> Path:

@@ -353,7 +353,7 @@ def rollout(steps=3, **changed):
         ([rollout(observation=None)], "observation"),
         ([rollout(episode=None)], "episode"),
         ([rollout(episode=torch.tensor([0, 0, 1]))], r"rollouts\[0\] must hold one episode"),
-        ([rollout(task_id=torch.zeros(3, dtype=torch.int64))], r"rollouts\[0\] must have one task_id"),
+        ([rollout(task_id=torch.zeros(3, dtype=torch.int64))], r"rollouts\[0\] must hold one episode of"),
         ([rollout(), rollout()], r"rollouts\[1\] repeats episode 0"),
         ([rollout()[0]], r"rollouts\[0\] must be a finished episode"),
     ],

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_training import assert_same, flat
+from small_training import CONFIG, assert_same, flat, make_actor
+from tensordict.nn import TensorDictSequential
 
 import lw_torchrl as lw
 from lw_torchrl.evaluation import score_evaluator
@@ -142,3 +143,28 @@ def test_an_evaluator_is_loaded_for_any_plans(tmp_path):
     loaded = lw.training.load_evaluator(tmp_path / "e.safetensors", lw.load_plans("MT50"))
     assert loaded.plans.fingerprint == lw.load_plans("MT50").fingerprint
     assert torch.equal(loaded.network.trunk[0].weight, evaluator.network.trunk[0].weight)
+
+
+# ---- imitation that also trains an evaluator
+
+
+def agreement(trainer):
+    rows = trainer.replay[:]
+    exact = lw.QAFTransform(PLANS)(rows.select("observation", "task_id"))["qaf"]
+    with torch.no_grad():
+        return ((trainer.actor[0].logits_of(rows) > 0) == exact).float().mean()
+
+
+def test_the_anchor_keeps_the_answers_exact(demos):
+    replay = lw.LanguageWorldExperienceReplay(demos, sampler=lw.TaskBalancedSampler())
+
+    def trainer(weight):
+        config = replace(CONFIG, qaf_anchor=weight, steps=60)
+        return lw.BehavioralCloningTrainer(TensorDictSequential(make(), make_actor()), replay, config, progress=False)
+
+    free, anchored = trainer(0.0), trainer(1.0)
+    before = agreement(free)
+    for trainer in (free, anchored):
+        trainer.train()
+    assert agreement(anchored) > max(before, agreement(free)) + 0.1
+    assert agreement(anchored) > 0.9

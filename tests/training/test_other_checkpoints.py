@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_training import CONFIG, PLANS, make_actor, make_descriptor_actor, make_replay, make_trainer
+from small_training import CONFIG, PLANS, make_actor, make_descriptor_actor, make_trainer
 from torchrl.data import RandomSampler
 from torchrl.envs import Compose
 
 import lw_torchrl as lw
 from lw_torchrl._util.tensor_files import read_tensors, write_tensors
 from lw_torchrl.training.checkpoint import training_file
-from lw_torchrl.training.cloning import bc_loss
 
 
 @pytest.fixture(scope="module")
@@ -111,28 +110,9 @@ def test_a_training_file_without_a_state_is_refused(demos, checkpoint, tmp_path)
     assert_refused(training_file(path), "the file holds no valid state", lambda: make_trainer(demos, path))
 
 
-OFFLINE = lw.OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
-EVALUATOR = lw.training.QueryEvaluatorConfig(steps=12, batch_size=8, held_out_pairs=0.0)
-
-
-def offline(demos, path):
-    return lw.OfflineTrainer(bc_loss(make_actor(), "l2"), make_replay(demos), OFFLINE, checkpoint=path, progress=False)
-
-
-def evaluator(demos, path):
-    data = lw.training.LabelledQueries(lw.LanguageWorldExperienceReplay(demos, label="executed"), EVALUATOR)
-    torch.manual_seed(0)
-    network = lw.modules.StateQueryEvaluator(PLANS, width=8, depth=1)
-    return lw.training.QueryEvaluatorTrainer(network, data, EVALUATOR, checkpoint=path, progress=False)
-
-
-TRAINERS = {"cloning": make_trainer, "offline": offline, "evaluator": evaluator}
-
-
-@pytest.mark.parametrize("name", TRAINERS)
-def test_one_training_at_a_time_writes_a_checkpoint(demos, tmp_path, holding, monkeypatch, name):
-    make, path = TRAINERS[name], tmp_path / "policy.safetensors"
-    trainer, late = make(demos, path), make(demos, path)
+def test_one_training_at_a_time_writes_a_checkpoint(demos, tmp_path, holding, monkeypatch):
+    path = tmp_path / "policy.safetensors"
+    trainer, late = make_trainer(demos, path), make_trainer(demos, path)
     release = holding(path)
     with pytest.raises(ValueError, match=f"checkpoint: another training is writing to '{path}'"):
         trainer.train()
@@ -143,13 +123,12 @@ def test_one_training_at_a_time_writes_a_checkpoint(demos, tmp_path, holding, mo
     with pytest.raises(ValueError, match=r"checkpoint: .* was written by another training"):
         late.train()
     assert path.read_bytes() == again
-    files = {"policy.safetensors"} | ({"policy.training.safetensors"} if name != "offline" else set())
-    assert {file.name for file in tmp_path.iterdir()} == files
-    assert make(demos, path).steps == CONFIG.steps
+    assert {file.name for file in tmp_path.iterdir()} == {"policy.safetensors", "policy.training.safetensors"}
+    assert make_trainer(demos, path).steps == CONFIG.steps
     real = importlib.metadata.version
     monkeypatch.setattr(
         "lw_torchrl._util.reproducibility.version", lambda name: "9.9.9" if name == "torch" else real(name)
     )
     with pytest.warns(UserWarning, match=r"with other versions \(torch .*, now 9.9.9\)") as caught:
-        make(demos, path)
+        make_trainer(demos, path)
     assert len(caught) == 1
