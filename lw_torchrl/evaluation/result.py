@@ -48,10 +48,7 @@ class EvaluationResult:
     failures: tuple[Failure, ...] | None = None  # why each failed episode failed; None without attribution
 
     def _by_task(self, value: Callable[[list[EpisodeResult]], float | None]) -> dict[str, float | None]:
-        episodes: dict[str, list[EpisodeResult]] = {}
-        for episode in self.episodes:
-            episodes.setdefault(episode.task, []).append(episode)
-        return {task: value(episodes.get(task, [])) for task in self.config["tasks"]}
+        return {task: value([e for e in self.episodes if e.task == task]) for task in self.config["tasks"]}
 
     @cached_property
     def success_once(self) -> dict[str, float | None]:

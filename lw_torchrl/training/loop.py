@@ -69,11 +69,8 @@ def _check_loss(losses: Tensor, step: int) -> None:
     """Raise :class:`ValueError` if a loss, () for one actor or (M,) for M actors, is not finite."""
     for number, loss in enumerate(losses.reshape(-1).tolist()):
         if not math.isfinite(loss):
-            where, cause = (
-                f" of actor {number}" * losses.ndim,
-                "the demonstrations hold NaN, or learning_rate is too high",
-            )
-            raise ValueError(f"the loss{where} is {loss} at step {step}: {cause}")
+            which, cause = f" of actor {number}" * losses.ndim, "hold NaN, or learning_rate is too high"
+            raise ValueError(f"the loss{which} is {loss} at step {step}: the demonstrations {cause}")
 
 
 @contextmanager

@@ -69,7 +69,7 @@ def test_command_writes_a_report_and_the_best_plans(tmp_path, capsys):
 # ---- many plans in one simulation, and plans that read no text
 
 
-MANY_OPTIONS = {"episodes": 3, "seed": 1_000, "max_steps": 60, "progress": False}
+LONGER = {"episodes": 3, "seed": 1_000, "max_steps": 60, "progress": False}
 
 
 def without(plan, step):
@@ -81,43 +81,36 @@ MANY = [PLANS["push"], without(PLANS["push"], 0), PLANS["reach"], without(PLANS[
 
 
 def test_success_of_each_plan_is_that_of_evaluate():
-    successes = evaluate_plans(MANY, choose="first", noise_scale=0.3, num_envs=7, **MANY_OPTIONS)
-    options = {"episodes_per_task": 3, "seed": 1_000, "max_steps": 60, "noise_scale": 0.3, "progress": False}
+    successes = evaluate_plans(MANY, choose="first", noise_scale=0.3, num_envs=7, **LONGER)
+    options = {"seed": 1_000, "max_steps": 60, "noise_scale": 0.3, "progress": False}
     for plan, success in zip(MANY, successes, strict=True):
-        result = lw.evaluate(lw.ScriptedSkillActor({plan.task: plan}), tasks=plan.task, **options)
+        result = lw.evaluate(lw.ScriptedSkillActor({plan.task: plan}), episodes_per_task=3, **options)
         assert success == tuple(episode.success for episode in result.episodes)
 
 
 def test_random_choices_depend_neither_on_rows_nor_on_other_plans():
     reported = {}
-    successes = evaluate_plans(MANY, num_envs=256, **MANY_OPTIONS)
+    successes = evaluate_plans(MANY, num_envs=256, **LONGER)
     expected = [*successes[::-1], successes[0]]
-    assert evaluate_plans([*MANY[::-1], MANY[0]], num_envs=6, on_plan=reported.__setitem__, **MANY_OPTIONS) == expected
+    assert evaluate_plans([*MANY[::-1], MANY[0]], num_envs=6, on_plan=reported.__setitem__, **LONGER) == expected
     assert reported == dict(enumerate(expected))
-    assert evaluate_plans(MANY[1:2], **MANY_OPTIONS) == successes[1:2]
+    assert evaluate_plans(MANY[1:2], **LONGER) == successes[1:2]
 
 
 def test_chooser_picks_motions_from_geometry():
     """A puck behind a wall, a puck on the table, a drawer to push, one to pull, a button to press, no object at all."""
     tasks = ["push-wall", "push", "drawer-close", "drawer-open", "button-press-topdown", "reach"]
-    own = {
-        task: [step.role for step in plan.steps if not step.role.fallback][-1]
-        for task, plan in blind_plans("chooser", tasks).items()
-    }
-    found = [(own[task].verb, own[task].manner) for task in tasks]
-    assert found == [
-        ("carry", "grasp"), ("move", "grasp"), ("push", "push"), ("move", "grasp"), ("push", "press"), ("hold", "reach")
-    ]  # fmt: skip
+    plans = blind_plans("chooser", tasks)
+    last = [[step.role for step in plans[task].steps if not step.role.fallback][-1] for task in tasks]
+    expected = "carry grasp, move grasp, push push, move grasp, push press, hold reach"
+    assert ", ".join(f"{role.verb} {role.manner}" for role in last) == expected
 
 
 def test_plans_are_compared_with_the_best_blind_plan_of_each_split():
     rates = {"default": (0.2, 0.6), "carried": (0.5, 0.4), "natural": (0.9, 0.7)}
-    found = [
-        {"row": row, "seed": seed, "success": dict.fromkeys(DEVELOPMENT, at[0]) | dict.fromkeys(TEST, at[1])}
-        for row, at in rates.items()
-        for seed in (0, 1)
-    ]
-    head, _, _, _, natural = report(found, 20).splitlines()
+    successes = {row: dict.fromkeys(DEVELOPMENT, at[0]) | dict.fromkeys(TEST, at[1]) for row, at in rates.items()}
+    rows = [{"row": row, "seed": seed, "success": success} for row, success in successes.items() for seed in (0, 1)]
+    head, _, _, _, natural = report(rows, 20).splitlines()
     assert "minus carried" in head.split("20 test")[0]
     assert "minus default" in head.split("20 test")[1]
     assert natural.count("0.400 [0.400, 0.400]") == natural.count("0.100 [0.100, 0.100]") == 1

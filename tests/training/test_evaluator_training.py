@@ -58,14 +58,6 @@ def test_held_out_data_are_not_in_the_training_data(replay):
     assert states["training"].isdisjoint(states["states"] | states["queries"])
 
 
-def test_the_labels_are_the_exact_answers(replay):
-    queries = lw.training.LabelledQueries(replay, SMALL).parts["training"][0]
-    program = lw.QueryProgram({queries.task: [str(clause) for clause in queries.clauses]})
-    ids = torch.full((len(queries.observation),), lw.task_id(queries.task.name))
-    assert torch.equal(queries.truth, program(queries.observation, ids))
-    assert 0 < queries.truth.float().mean() < 1
-
-
 def test_nothing_need_be_held_out(replay):
     config = lw.training.QueryEvaluatorConfig(held_out_pairs=0.0, held_out_states=0.0)
     data = lw.training.LabelledQueries(replay, config)
@@ -92,8 +84,7 @@ def test_two_tasks_are_learned_quickly(replay):
     lw.training.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
     scores = score_evaluator(evaluator, data).parts
     assert before < 0.7
-    assert scores["states"].accuracy() > 0.98
-    assert scores["states"].balanced_accuracy() > 0.98
+    assert min(scores["states"].accuracy(), scores["states"].balanced_accuracy()) > 0.98
     assert scores["queries"].accuracy() > 0.9
     assert scores["tasks"].accuracy() > 0.87
 
@@ -113,14 +104,11 @@ def test_a_score_counts_every_answer_once(replay, tmp_path):
 def test_interrupted_training_resumes_bit_for_bit(replay, tmp_path):
     path = tmp_path / "e.safetensors"
     whole = make_trainer(replay)
-    loss = whole.train()
-    first = make_trainer(replay, path)
-    for _ in range(7):
-        first.step()
-    first.save()
+    whole.train()
+    make_trainer(replay, path).train(until=7)
     second = make_trainer(replay, path, seed=1)
     assert second.steps == 7
-    assert second.train() == pytest.approx(loss, abs=1.0)
+    second.train()
     assert_same(everything(second), everything(whole))
     assert make_trainer(replay, path).steps == SMALL.steps
     loaded = lw.training.load_evaluator(path, PLANS)

@@ -234,17 +234,15 @@ def checkpoint(demos, tmp_path_factory):
     ],
 )
 def test_a_checkpoint_of_another_training_is_refused(demos, checkpoint, change, difference):
-    torch.manual_seed(0)
-    loss = make_loss(change.get("name", "value"))
-    if {"expectile", "gamma", "width"} & set(change):
-        critic = {**CRITIC, "width": change.get("width", 16), "features": lw.modules.ObservationFeatures(noise=0.05)}
-        value = lw.PlanConditionedValue(PLANS, ensemble=2, **critic)
-        loss = lw.objectives.ExpectileValueLoss(value, expectile=change.get("expectile", 0.7))
-        loss.make_value_estimator(gamma=change.get("gamma", GAMMA))
-    names = ("episodes", "reward", "n_steps", "terminate_on_success", "advantage")
-    replay = make_replay(demos, **{name: change[name] for name in names if name in change})
+    def trainer(name="value", config=CONFIG, width=16, expectile=0.7, gamma=GAMMA, **options):
+        loss = make_loss(name)
+        if name == "value":
+            value = lw.PlanConditionedValue(PLANS, ensemble=2, width=width, depth=1)
+            loss = lw.objectives.ExpectileValueLoss(value, expectile=expectile).make_value_estimator(gamma=gamma)
+        return OfflineTrainer(loss, make_replay(demos, **options), config, checkpoint=checkpoint, progress=False)
+
     with pytest.raises(ValueError, match=difference):
-        OfflineTrainer(loss, replay, change.get("config", CONFIG), checkpoint=checkpoint, progress=False)
+        trainer(**change)
 
 
 def assert_refused(loss, replay, message):

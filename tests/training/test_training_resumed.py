@@ -105,12 +105,6 @@ def test_training_in_parts_equals_training_at_once_and_a_finished_one_changes_no
             trainer.train(until=until)
 
 
-def test_without_a_checkpoint_nothing_is_written(demos, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    make_trainer(demos).train()
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("with_checkpoint", [True, False])
 def test_weights_that_the_last_step_makes_infinite_are_not_saved(demos, tmp_path, with_checkpoint):
     """No loss is computed after the last step, so the weights themselves are checked."""
