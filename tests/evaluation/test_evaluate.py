@@ -195,8 +195,7 @@ class Recorder(nn.Module):
 def test_the_actor_runs_in_eval_mode_and_its_mode_is_restored(training):
     actor = TensorDictModule(Recorder(), in_keys=["observation"], out_keys=["action"]).train(training)
     run(actor, "reach", max_steps=3)
-    assert actor.training is training
-    assert actor.module.training is training
+    assert actor.training is actor.module.training is training
     assert {call[:3] for call in actor.module.calls} == {(False, False, ExplorationType.DETERMINISTIC)}
     assert len({call[3] for call in actor.module.calls}) == 1, "every forward pass has the same number of rows"
 

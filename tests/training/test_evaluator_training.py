@@ -101,7 +101,7 @@ def test_a_score_counts_every_answer_once(replay, tmp_path):
     assert "held-out queries" in score.table()
 
 
-def test_interrupted_training_resumes_bit_for_bit(replay, tmp_path):
+def test_interrupted_training_resumes_bit_for_bit_and_another_one_is_refused(replay, tmp_path):
     path = tmp_path / "e.safetensors"
     whole = make_trainer(replay)
     whole.train()
@@ -114,11 +114,6 @@ def test_interrupted_training_resumes_bit_for_bit(replay, tmp_path):
     loaded = lw.training.load_evaluator(path, PLANS)
     assert not loaded.training
     assert_same(flat(dict(loaded.state_dict())), flat(dict(whole.evaluator.state_dict())))
-
-
-def test_a_checkpoint_of_another_training_is_refused(replay, tmp_path):
-    path = tmp_path / "e.safetensors"
-    make_trainer(replay, path).train()
     with pytest.raises(ValueError, match=r"its training differs in .*batch_size"):
         make_trainer(replay, path, config=replace(SMALL, batch_size=32))
     with pytest.raises(ValueError, match=r"its evaluator differs in .*width"):

@@ -146,11 +146,12 @@ def test_the_value_n_steps_ahead_is_discounted_n_times(demos, name):
         return zero
 
     estimator.value_estimate = note
-    sample, steps = trainer.replay.sample, []
-    trainer.replay.sample = lambda size: (batch := sample(size), steps.append(batch["steps_to_next_obs"].clone()))[0]
+    sample, batches = trainer.replay.sample, []
+    trainer.replay.sample = lambda size: batches.append(sample(size)) or batches[-1].clone()
     trainer.train()
-    torch.testing.assert_close(seen[0], GAMMA ** steps[0].float())
-    assert steps[0].max() == 3
+    steps = batches[0]["steps_to_next_obs"]
+    torch.testing.assert_close(seen[0], GAMMA ** steps.float())
+    assert steps.max() == 3
 
 
 def test_cqls_first_actor_loss_is_not_added_to_the_other_one(demos):

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import replace
+from unittest.mock import Mock, patch
 
 import pytest
 import torch
@@ -166,19 +167,14 @@ def test_a_kill_at_any_moment_leaves_a_whole_checkpoint_that_resumes_bit_for_bit
 
 
 @pytest.mark.parametrize("failing", ["pathlib.Path.write_bytes", "os.replace"])
-def test_a_full_disk_leaves_the_old_checkpoint(demos, tmp_path, monkeypatch, failing):
+def test_a_full_disk_leaves_the_old_checkpoint(demos, tmp_path, failing):
     path = tmp_path / "checkpoint.safetensors"
     with pytest.raises(KeyboardInterrupt):
         make_trainer(demos, path, stop_at=6).train()
     files = {file: file.read_bytes() for file in tmp_path.iterdir()}
 
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    resumed = make_trainer(demos, path)
-    monkeypatch.setattr(failing, full)
-    with pytest.raises(OSError, match="No space left"):
+    resumed, full = make_trainer(demos, path), Mock(side_effect=OSError(28, "No space left on device"))
+    with patch(failing, full), pytest.raises(OSError, match="No space left"):
         resumed.save()
-    monkeypatch.undo()
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == files
     assert make_trainer(demos, path).steps == 5
