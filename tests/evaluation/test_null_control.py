@@ -145,7 +145,7 @@ def test_a_failure_of_a_policy_without_plans_has_no_step():
     torch.manual_seed(0)
     decoder = lw.modules.MLPDecoder(width=8, depth=1)
     actor = lw.modules.DescriptorConditionedActor(TASK, condition="one-hot", decoder=decoder)
-    [failure] = attribute_failures(run(actor, plans=PLANS), PLANS, actor=actor, **RUN)
+    [failure] = attribute_failures(run(actor, plans=PLANS, also_record=RECORDED[:3]), PLANS, actor=actor, **RUN)
     assert failure.cause in ("actuation", "policy")
     assert failure.step is None
     assert "skill" not in failure.counterfactuals
