@@ -32,6 +32,7 @@ def new_figure(width: float, height: float) -> Any:
 
 def saved(figure: Any, path: AnyPath | None) -> Any:
     """Write a figure to ``path`` unless it is None, and return the figure."""
+    check_image(path)
     if path is not None:
         with replacing(path) as temporary:
             figure.savefig(temporary, dpi=140)
@@ -58,7 +59,6 @@ def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title
         >>> plot_success(result).axes[0].get_title()
         'mean over 1 task: 1.000'
     """
-    check_image(path)
     rates = {task: rate for task, rate in result.success_once.items() if rate is not None}
     trials = result.config["episodes_per_task"]
     tasks = sorted(rates, key=lambda task: (rates[task], task))
@@ -95,18 +95,15 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
     """
     from matplotlib.ticker import MaxNLocator
 
-    check_image(path)
     counts, trials = result.failure_counts(), result.config["episodes_per_task"]
     tasks = sorted((task for task in counts if counts[task]), key=lambda task: (counts[task].total(), task))
     failures = sum(row.total() for row in counts.values())
     figure = new_figure(8.0, 1.9 + 0.27 * len(tasks) + 0.1 * len({cause for row in counts.values() for cause in row}))
     axes = figure.subplots()
     left = np.zeros(len(tasks))
-    for cause, meaning in CAUSES.items():
+    for cause in [cause for cause in CAUSES if any(row[cause] for row in counts.values())]:
         numbers = [counts[task][cause] for task in tasks]
-        if not any(numbers):
-            continue
-        label = f"{cause}: {meaning} ({sum(numbers)})"
+        label = f"{cause}: {CAUSES[cause]} ({sum(numbers)})"
         bars = axes.barh(tasks, numbers, left=left, color=CAUSE_COLORS[cause], label=label, height=0.7)
         axes.bar_label(bars, [str(n) if n else "" for n in numbers], label_type="center", color="white", fontsize=8)
         left = left + numbers

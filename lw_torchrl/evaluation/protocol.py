@@ -111,8 +111,6 @@ def evaluate(
         raise ValueError("attribute=True requires plans: pass plans, or an actor that has plans")
     if reference is not None and not attribute:
         raise ValueError("reference requires attribute=True, which re-runs failed episodes with the reference plans")
-    if isinstance(also_record, str):
-        raise TypeError(f"also_record must be a list of keys, got the string {also_record!r}")
     for key in also_record:
         check_key("also_record", key)
     shared: dict[str, Any] = {"seed": seed, "max_steps": max_steps or own_suite.max_steps}

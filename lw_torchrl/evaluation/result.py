@@ -48,10 +48,7 @@ class EvaluationResult:
     failures: tuple[Failure, ...] | None = None  # why each failed episode failed; None without attribution
 
     def _by_task(self, value: Callable[[list[EpisodeResult]], float | None]) -> dict[str, float | None]:
-        episodes: dict[str, list[EpisodeResult]] = {}
-        for episode in self.episodes:
-            episodes.setdefault(episode.task, []).append(episode)
-        return {task: value(episodes.get(task, [])) for task in self.config["tasks"]}
+        return {task: value([e for e in self.episodes if e.task == task]) for task in self.config["tasks"]}
 
     @cached_property
     def success_once(self) -> dict[str, float | None]:
@@ -129,13 +126,9 @@ class EvaluationResult:
             if set(content["success_once"]) != {*tasks}:
                 raise ValueError("success_once and config must have the same tasks")
             return result
-        except FileNotFoundError:
-            advice = "write a result with evaluate(...).save(path)"
-            raise FileNotFoundError(f"path: no result file {str(path)!r}; {advice}") from None
         except (ValueError, KeyError, TypeError) as error:
-            expected = f"result of {FORMAT} version {FORMAT_VERSION}"
-            reason = f"{type(error).__name__}: {str(error)[:500]}"
-            raise ValueError(f"path: {str(path)!r} is not a {expected} ({reason})") from error
+            name = f"{str(path)!r} is not a result of {FORMAT} version {FORMAT_VERSION}"
+            raise ValueError(f"path: {name} ({type(error).__name__}: {str(error)[:500]})") from error
 
     def _check(self) -> None:
         """Raise :class:`ValueError` unless config, episodes and failures agree."""
@@ -146,17 +139,11 @@ class EvaluationResult:
                 raise ValueError(f"episodes: success, first_success and success_at_end must agree, got {episode}")
         counts = Counter(task for task, _ in {(episode.task, episode.episode) for episode in self.episodes})
         if not tasks or counts != dict.fromkeys(tasks, number) or len(self.episodes) != number * len(tasks):
-            expected = f"{number} distinct episodes of each task in config"
-            raise ValueError(f"episodes must hold {expected}, got {dict(counts)}")
-        if self.failures is None:
-            return
-        failed = sorted((episode.task, episode.episode) for episode in self.episodes if not episode.success)
-        if failed != sorted((failure.task, failure.episode) for failure in self.failures):
-            raise ValueError("failures must hold exactly one Failure for each episode without success")
-        for failure in self.failures:
-            if failure.seed != self.config["seed"] or failure.at >= last:
-                got = f"got seed {failure.seed} and time step {failure.at}"
-                raise ValueError(f"failures must have the config's seed and a time step below {last}, {got}")
+            raise ValueError(f"episodes must hold {number} episodes of each task in config, got {dict(counts)}")
+        failed = sorted((e.task, e.episode, self.config["seed"]) for e in self.episodes if not e.success)
+        failures = failed if self.failures is None else sorted((f.task, f.episode, f.seed) for f in self.failures)
+        if failed != failures or any(failure.at >= last for failure in self.failures or ()):
+            raise ValueError(f"failures must hold a Failure, with the same seed, of each failed episode, at t < {last}")
 
     def table(self) -> str:
         """Return a text table of each task's success rates and mean first successful time step."""

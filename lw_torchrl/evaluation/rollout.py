@@ -75,10 +75,9 @@ def rollout(
         chosen = [tasks[task] for task in part]
         base = LanguageWorldEnv(chosen, num_envs=num_rows(part, ROWS, num_envs), strict=True, **env_options)
         env = _with_transforms(base, first, transform_of(actor, plans), _transform_of_evaluator(evaluator))
-        more = [unravel_key(key) for key in optional]
-        keys_of_parts = {unravel_key(key) for each in (actor, evaluator) for key in getattr(each, "out_keys", ())}
-        written = keys_of_parts | _written(env)
-        recorded = list(dict.fromkeys([*map(unravel_key, keys), *(key for key in more if key in written)]))
+        written = {unravel_key(key) for each in (actor, evaluator) for key in getattr(each, "out_keys", ())}
+        more = [key for key in map(unravel_key, optional) if key in written | _written(env)]
+        recorded = list(dict.fromkeys([*map(unravel_key, keys), *more]))
         acting = actor if wrap is None else wrap(actor)
         if evaluator is not None and not isinstance(evaluator, Transform):
             acting = EvaluatorInFront(evaluator, acting)
@@ -127,17 +126,15 @@ def _written(env: EnvBase) -> set[NestedKey]:
 
 
 def _checked(policy: Acts, env: EnvBase, keys: Iterable[NestedKey]) -> Acts:
-    """Wrap ``policy`` to check every action and, at the first call, that policy or environment writes each key."""
+    """Wrap ``policy`` to check every action, and that policy or environment writes each key."""
     by_env, size = _written(env), env.action_spec.shape[-1]
-    unseen = [key for key in keys if key not in by_env]
+    others = [key for key in keys if key not in by_env]
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = policy(tensordict)
-        read_action(tensordict, size)
-        while unseen:
-            if (key := unseen.pop()) not in tensordict.keys(True):
-                written = tensordict.exclude("_step").keys(True, True)
-                raise unknown_name("also_record", key, [*dict.fromkeys([*written, *sorted(by_env, key=str)])])
+        read_action(tensordict := policy(tensordict), size)
+        for key in others:
+            if key not in tensordict.keys(True):
+                raise unknown_name("also_record", key, {*tensordict.exclude("_step").keys(True, True), *by_env})
         return tensordict
 
     return run

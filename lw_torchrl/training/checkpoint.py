@@ -13,7 +13,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import differences, typed
+from lw_torchrl._util.checks import differences, shown, typed
 from lw_torchrl._util.files import AnyPath, absent_policy, companion, expanded, locked, shipped_policy
 from lw_torchrl._util.reproducibility import LIBRARIES, warn_of_other_versions
 from lw_torchrl._util.tensor_files import AllocationLimit, pop_state, read_tensors, write_tensors
@@ -25,6 +25,7 @@ from lw_torchrl.modules.query_evaluator import QueryEvaluator
 VERSION = 2
 KINDS: Mapping[str, str] = {"actor": "a policy", "evaluator": "an evaluator", "training": "a training state"}
 _ARGUMENTS = {"actor": "checkpoint", "evaluator": "evaluator", "training": "checkpoint"}
+_ADVICE = "choose another file, or delete this file to start again"
 _TEXTS = "texts/"  # prefix of text vectors, which identify the text encoder that a file was saved with
 _TEXT_TOLERANCE = 0.01  # between machines, the vectors of the same encoder differ by less than this
 
@@ -98,11 +99,7 @@ def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> No
 
 @typed
 def load_evaluator(
-    path: AnyPath,
-    plans: AnyPlans,
-    *,
-    text_encoder: TextEncoder | None = None,
-    parts: Sequence[type[nn.Module]] = (),
+    path: AnyPath, plans: AnyPlans, *, text_encoder: TextEncoder | None = None, parts: Sequence[type[nn.Module]] = ()
 ) -> QueryEvaluator:
     """Load an evaluator in eval mode, for the conditions of any plans.
 
@@ -110,10 +107,9 @@ def load_evaluator(
         path, text_encoder, parts: see :func:`load_actor`, which also lists the errors.
         plans: the plans to evaluate; a :class:`ValueError` is raised if the evaluator cannot evaluate their conditions.
     """
-    answered = [as_plans(plans).to_json()]
-    evaluator: QueryEvaluator = _load(
-        Path(path), "evaluator", lambda node: from_description({**node, "plans": answered}, text_encoder, parts)
-    )
+    new = {"plans": [as_plans(plans).to_json()]}
+    loaded = _load(Path(path), "evaluator", lambda node: from_description({**node, **new}, text_encoder, parts))
+    evaluator: QueryEvaluator = loaded
     return evaluator
 
 
@@ -121,15 +117,11 @@ def _save(path: AnyPath, kind: str, module: nn.Module, about: dict[str, Any]) ->
     if reserved := sorted({"format", "version", "versions", kind, "state"} & set(about)):
         raise ValueError(f"about must not use reserved names, got {', '.join(reserved)}")
     check_can_be_saved(module, kind)
-    _write(path, kind, {kind: describe(module), **about}, contents_of(module))
+    write_tensors(path, {**_header(kind), kind: describe(module), **about}, contents_of(module))
 
 
 def _header(kind: str) -> dict[str, Any]:
     return {"format": f"lw_torchrl.{kind}", "version": VERSION}
-
-
-def _write(path: AnyPath, kind: str, description: Mapping[str, Any], tensors: Any, state: Any = None) -> None:
-    write_tensors(path, {**_header(kind), **description}, tensors, state)
 
 
 def _load(path: Path, kind: str, make: Callable[[Any], nn.Module]) -> Any:
@@ -142,8 +134,8 @@ def _load(path: Path, kind: str, make: Callable[[Any], nn.Module]) -> Any:
         raise
     except Exception as error:  # a corrupted description can make any constructor fail with any error
         hint = "; import the module that registers your relations first" if isinstance(error, PlanError) else ""
-        message = f"{_ARGUMENTS[kind]}: the {kind} in {str(path)!r} cannot be rebuilt ({_one_line(error)}){hint}"
-        raise ValueError(message) from error
+        name = f"{_ARGUMENTS[kind]}: the {kind} in {str(path)!r}"
+        raise ValueError(f"{name} cannot be rebuilt ({_one_line(error)}){hint}") from error
     return module.eval()
 
 
@@ -152,15 +144,13 @@ def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if not path.exists():
         command = "train-evaluator" if kind == "evaluator" else "train"
         raise FileNotFoundError(f"{_ARGUMENTS[kind]}: {absent_policy(path, command)}")
+    name = f"{_ARGUMENTS[kind]}: {str(path)!r}"
     try:
         description, tensors = read_tensors(path)
     except ValueError as error:
-        raise ValueError(f"{_ARGUMENTS[kind]}: {str(path)!r} cannot be read: {error}") from error
-    if {name: description.get(name) for name in ("format", "version")} != _header(kind):
-        raise ValueError(
-            f"{_ARGUMENTS[kind]}: {str(path)!r} must hold {KINDS[kind]} of version {VERSION}, got format "
-            f"{description.get('format')!r:.60}, version {description.get('version')!r:.60}"
-        )
+        raise ValueError(f"{name} cannot be read: {error}") from error
+    if (header := {key: description.get(key) for key in ("format", "version")}) != _header(kind):
+        raise ValueError(f"{name} must hold {KINDS[kind]} of version {VERSION}, got {shown(header)}")
     return description, tensors
 
 
@@ -209,21 +199,19 @@ def check_finite(weights: Mapping[str, Tensor]) -> None:
 
 
 def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
-    """Raise an error unless a module can be saved and loaded. Trainers call this before training, so that the trained
-    weights can be saved."""
+    """Raise an error unless a module can be saved and loaded. Trainers call this before training."""
     widths = [vectors.shape[-1] for vectors in text_vectors(module).values()] or [TEXT_DIMENSION]
     custom = [type(part) for part in module.modules() if not type(part).__module__.startswith("torch.")]
     description = json.loads(json.dumps(describe(module)))
     try:
-        with torch.random.fork_rng(devices=[]):
-            # A dummy text encoder avoids loading a language model just for this check.
+        with torch.random.fork_rng(devices=[]):  # a dummy text encoder, because a language model takes long to load
             again = from_description(description, lambda texts: torch.ones(len(texts), widths[0]), custom)
         if not same_keys(module, again):
             raise ValueError("in_keys or out_keys were changed after construction; pass them to the constructor")
         _copy_tensors(module.state_dict(), again.state_dict(keep_vars=True))
     except Exception as error:
-        message = f"{kind} cannot be saved, because it cannot be rebuilt from its description"
-        raise ValueError(f"{message} ({_one_line(error)})") from error
+        reason = f"its description does not rebuild it ({_one_line(error)})"
+        raise ValueError(f"{kind} cannot be saved, because {reason}") from error
 
 
 def policy_file(path: AnyPath) -> Path:
@@ -254,19 +242,15 @@ def training_file(checkpoint: Path) -> Path:
 
 
 def check_description(path: Path, expected: Mapping[str, Any], stored: Mapping[str, Any] | None = None) -> None:
-    """Raise :class:`ValueError` unless a file's description has the entries ``expected``.
-
-    ``stored`` is the file's description; None reads the description of the policy file ``path``.
-    """
+    """Raise :class:`ValueError` unless the description of the policy file ``path``, or ``stored``, has the entries
+    ``expected``."""
     stored = read_description(path) if stored is None else stored
     for part, now in json.loads(json.dumps(expected)).items():  # as JSON, which has no tuples
         if (before := stored.get(part)) != now:
             names = differences(before if isinstance(before, dict) else {}, now or {})
             kind = "architecture" if part in ("actor", "actors", "evaluator", "loss") else "configuration"
-            raise ValueError(
-                f"checkpoint: {str(path)!r} has a different {kind}: its {part} differs in {', '.join(names[:8])}"
-                f"{', ...' * (len(names) > 8)}; choose another file, or delete this file to start again"
-            )
+            differs = f"its {part} differs in {', '.join(names[:8])}{', ...' * (len(names) > 8)}"
+            raise ValueError(f"checkpoint: {str(path)!r} has a different {kind}: {differs}; {_ADVICE}")
 
 
 class CheckpointFiles:
@@ -306,17 +290,17 @@ class CheckpointFiles:
         self, description: Mapping[str, Any], device: torch.device, tensors: Any, state: Any, part: nn.Module | None
     ) -> None:
         """Atomically write the training state (``tensors``, ``state``), then the policy or evaluator (``part``)."""
-        _write(self.state, "training", {**description, "device": device.type}, tensors, state)
+        write_tensors(self.state, {**_header("training"), **description, "device": device.type}, tensors, state)
         self._known = self._version()
         if self.part is not None and part is not None:
-            _write(self.checkpoint, self.part, description, contents_of(part))
+            write_tensors(self.checkpoint, {**_header(self.part), **description}, contents_of(part))
 
     def exist(self) -> bool:
         """Return whether the training state exists; raise ValueError if only the policy exists, which training would
         overwrite."""
         if not self.state.exists() and self.checkpoint.exists():
             message = f"{str(self.checkpoint)!r} exists, but its training state {str(self.state)!r} does not"
-            raise ValueError(f"checkpoint: {message}; choose another file, or delete this file to start again")
+            raise ValueError(f"checkpoint: {message}; {_ADVICE}")
         return self.state.exists()
 
     def restore(
@@ -335,16 +319,13 @@ class CheckpointFiles:
             policy, _ = _read(self.checkpoint, self.part)
             check_description(self.checkpoint, {self.part: description[self.part]}, policy)
         if (before := stored_description["device"]) != device.type:
-            warnings.warn(
-                f"{name} was trained on {before!r} and resumes on {device.type!r}: training continues with the "
-                "same minibatches, but results will not be bit-identical to an uninterrupted run",
-                stacklevel=4,
-            )
+            message = f"{name} was trained on {before!r} and resumes on {device.type!r}: training continues with the"
+            message += " same minibatches, but results will not be bit-identical to an uninterrupted run"
+            warnings.warn(message, stacklevel=4)
         warn_of_other_versions(self.state, stored_description["versions"], LIBRARIES)
         try:
             state = pop_state(stored_description, stored)
             _copy_tensors(stored, tensors)
             load_state(state)
         except (ValueError, KeyError, TypeError, RuntimeError) as error:
-            message = f"{name} does not fit: the file is corrupted, or was written for a different architecture"
-            raise ValueError(f"{message} ({_one_line(error)})") from error
+            raise ValueError(f"{name} is corrupted, or of a different architecture ({_one_line(error)})") from error

@@ -78,10 +78,8 @@ class EvaluatorAnchor:
     def __init__(self, actor: nn.Module) -> None:
         evaluators = evaluators_of(actor)
         if len(evaluators) != 1:
-            raise ValueError(
-                "qaf_anchor requires a policy with exactly one learned evaluator, such as "
-                f"TensorDictSequential(evaluator, actor), got {type(actor).__name__} with {len(evaluators)} evaluators"
-            )
+            got = f"got {type(actor).__name__} with {len(evaluators)}"
+            raise ValueError(f"qaf_anchor requires one evaluator, as in TensorDictSequential(evaluator, actor), {got}")
         self.evaluator, plans = evaluators[0], evaluators[0].plans
         self.program, tables = plan_program(plans), PlanTables(plans)
         self.steps = TaskTables(tables.index, _Steps(tables.mask), f"tasks without a plan in {plans!r}")

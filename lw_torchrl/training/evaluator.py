@@ -68,7 +68,7 @@ class _StateQueries:
 
     def to(self, device: torch.device) -> None:
         """Move the states and clauses to a device."""
-        self.observation, self.clauses = self.observation.to(device), _on(self.clauses, device)
+        self.observation, self.clauses = self.observation.to(device), Clauses(*(t.to(device) for t in self.clauses))
 
     @staticmethod
     def loss(network: Any, batch: TensorDictBase, config: Any) -> Tensor:
@@ -116,7 +116,7 @@ class _PictureQueries:
         """Move the pictures, answers and clauses to a device."""
         for name in ("pixels", "truths", "weights"):
             setattr(self, name, [tensor.to(device) for tensor in getattr(self, name)])
-        self.clauses = [_on(clauses, device) for clauses in self.clauses]
+        self.clauses = [Clauses(*(table.to(device) for table in clauses)) for clauses in self.clauses]
         self.positions = [(a.to(device), b.to(device), c.to(device)) for a, b, c in self.positions]
 
     @staticmethod
@@ -139,10 +139,6 @@ def _as_tensordict(clauses: Clauses) -> TensorDict:
     return TensorDict(dict(zip(Clauses._fields[:7], clauses[:7], strict=True)))
 
 
-def _on(clauses: Clauses, device: torch.device) -> Clauses:
-    return Clauses(*(table.to(device) for table in clauses))
-
-
 def _known_positions(queries: TaskQueries, names: tuple[str, ...]) -> tuple[Tensor, Tensor, Tensor]:
     """Return the indices (n,) int64 of a task's objects in ``names``, the values (R, n, 4) float32, and a mask (n, 4).
 
@@ -162,8 +158,7 @@ def _known_positions(queries: TaskQueries, names: tuple[str, ...]) -> tuple[Tens
 
 def _answer_weights(queries: TaskQueries) -> Tensor:
     """Return weights (2, Q) float32 of each clause's false and true answers, to balance predicates and truth values."""
-    true = queries.truth.double().mean(0)
-    predicates = [clause.predicate for clause in queries.clauses]
+    true, predicates = queries.truth.double().mean(0), [clause.predicate for clause in queries.clauses]
     weights = torch.zeros(2, len(predicates))
     for predicate in {*predicates}:
         own = torch.tensor([other == predicate for other in predicates])

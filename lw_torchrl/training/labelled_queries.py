@@ -91,10 +91,8 @@ class TaskQueries:
         """Return the input for an evaluator that reads ``key`` ("observation" or "pixels")."""
         view = self.observation if key == "observation" else self.pixels
         if view is None:
-            raise ValueError(
-                f"data must have the column {key!r}, which the evaluator reads; call lw.data.add_pictures(root, ...) "
-                "and replay.add_column('pixels', lw.data.load_pictures(replay, ...))"
-            )
+            advice = "call replay.add_column('pixels', lw.data.load_pictures(replay, ...))"
+            raise ValueError(f"data must have the column {key!r}, which the evaluator reads; {advice}")
         return view
 
 
@@ -191,14 +189,12 @@ def _at_most(number: int, rows: Tensor, generator: torch.Generator) -> Tensor:
 def _check_pictures(rows: TensorDictBase, layout: Layout) -> None:
     """Raise ValueError if consecutive pictures are equal although the hand moved: one then shows an earlier state."""
     pixels, hand = rows.get("pixels", None), rows.get("observation")[:, layout.positions[0]]
-    if pixels is None or len(rows) < 2:
+    if pixels is None:
         return
-    moved = (hand[1:] - hand[:-1]).norm(dim=-1) > _MOVED
-    same_episode = rows.get(("collector", "traj_ids"))[1:] == rows.get(("collector", "traj_ids"))[:-1]
-    for row in (moved & same_episode).nonzero().flatten().tolist():
-        if torch.equal(pixels[row], pixels[row + 1]):
-            hint = "two consecutive pictures are equal although the hand moved between them"
-            raise ValueError(f"every must be the number of time steps between pictures: {hint}")
+    moved, episode = hand.diff(dim=0).norm(dim=-1) > _MOVED, rows.get(("collector", "traj_ids"))
+    places = (moved & (episode.diff() == 0)).nonzero().flatten().tolist()
+    if any(torch.equal(pixels[row], pixels[row + 1]) for row in places):
+        raise ValueError("every must be the time steps between pictures: two are equal although the hand moved")
 
 
 def _draw_tasks(held_out: int | tuple[str, ...], names: Sequence[str], generator: torch.Generator) -> tuple[str, ...]:

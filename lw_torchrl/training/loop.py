@@ -8,7 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from types import FrameType
+from types import FrameType, SimpleNamespace
 from typing import Any, TypedDict
 
 import torch
@@ -50,8 +50,9 @@ def make_optimizer(
 
 def _rate_factor(config: Any, step: int) -> float:
     """Return the fraction of the initial learning rate after ``step`` optimizer steps: a cosine to 0, or 1."""
-    is_constant = getattr(config, "schedule", "cosine") == "constant"
-    return 1.0 if is_constant else 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
+    if getattr(config, "schedule", "cosine") == "constant":
+        return 1.0
+    return 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
 
 
 def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int) -> None:
@@ -64,31 +65,21 @@ def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int
             group["lr"] = rate
 
 
-def _check_loss(losses: Tensor, step: int, config: Any) -> None:
+def _check_loss(losses: Tensor, step: int) -> None:
     """Raise :class:`ValueError` if a loss, () for one actor or (M,) for M actors, is not finite."""
-    if losses.isfinite().all():
-        return
-    number = int((~losses.reshape(-1).isfinite()).nonzero()[0])
-    actor = f" of actor {number}" if losses.ndim else ""
-    raise ValueError(
-        f"the loss{actor} is {losses.reshape(-1)[number].item()} at step {step}: the demonstrations hold NaN, or the "
-        f"learning rate {config.learning_rate} is too high"
-    )
-
-
-class _Interrupt:
-    """A record of whether Ctrl-C was pressed once (``requested``) or twice (``insisted``)."""
-
-    requested = insisted = False
+    for number, loss in enumerate(losses.reshape(-1).tolist()):
+        if not math.isfinite(loss):
+            which, cause = f" of actor {number}" * losses.ndim, "hold NaN, or learning_rate is too high"
+            raise ValueError(f"the loss{which} is {loss} at step {step}: the demonstrations {cause}")
 
 
 @contextmanager
-def _interrupts_between_steps() -> Iterator[_Interrupt]:
-    """Record the first Ctrl-C, and raise :class:`KeyboardInterrupt` at the end of the block.
+def _interrupts_between_steps() -> Iterator[SimpleNamespace]:
+    """Record the first Ctrl-C (``requested``), and raise :class:`KeyboardInterrupt` at the end of the block.
 
-    A second Ctrl-C raises immediately. Nothing changes outside the main thread, or if SIGINT is ignored.
+    A second Ctrl-C (``insisted``) raises immediately. Nothing changes outside the main thread, or if SIGINT is ignored.
     """
-    interrupt = _Interrupt()
+    interrupt = SimpleNamespace(requested=False, insisted=False)
     previous = signal.getsignal(signal.SIGINT) if threading.current_thread() is threading.main_thread() else None
     if not callable(previous):
         yield interrupt
@@ -213,14 +204,12 @@ class Training:
     def _run(self, drawn: Any) -> dict[str, Tensor]:
         """Run :meth:`update` on drawn minibatches; on a CUDA device, run it as one CUDA graph."""
         if self._captured is None:
-            captured = CapturedFunction(lambda each: self.update(self.batch(each)), self.device)
-            parts = [self, self.module, *self.networks]
-            parts += [getattr(each.source, "transform", None) for each in self.minibatches]
-            if self.capture is False:
-                captured.tries = False
-            elif self.capture is None and captured.tries and (name := foreign_code(parts)):
+            self._captured = captured = CapturedFunction(lambda each: self.update(self.batch(each)), self.device)
+            captured.tries &= self.capture is not False
+            transforms = (getattr(each.source, "transform", None) for each in self.minibatches)
+            parts = [self, self.module, *self.networks, *transforms]
+            if self.capture is None and captured.tries and (name := foreign_code(parts)):
                 captured.give_up(f"{name} may change its attributes from step to step; if not, use capture=True")
-            self._captured = captured
         return self._captured(drawn, tuple(network.training for network in self.networks))
 
     def combined(self, drawn: list[Any]) -> Any:
@@ -242,7 +231,7 @@ class Training:
         terms = [value for name, value in values.items() if name.startswith("loss")]
         values["loss"] = loss = terms[0] if len(terms) == 1 else torch.stack(terms).sum(0)
         if self.device == CPU:  # on a GPU, reading the loss would wait for the device
-            _check_loss(loss.detach(), self.steps, self.config)
+            _check_loss(loss.detach(), self.steps)
         self.optimizer.zero_grad()
         loss.sum().backward()
         self.clip_gradients()
@@ -339,7 +328,7 @@ class Training:
         read = {name: torch.stack([values[name] for values in self._values]).cpu() for name in names}
         self.last = {name: value.double().mean().item() for name, value in read.items()}
         for step, loss in enumerate(read["loss"], self.steps - len(self._values)):
-            _check_loss(loss, step, self.config)
+            _check_loss(loss, step)
         return read["loss"]
 
     def save(self) -> None:

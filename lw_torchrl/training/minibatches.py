@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import product
 from typing import Any
 
 import torch
@@ -80,10 +81,7 @@ class IndexedReplay:
         if device == CPU or not isinstance(source.storage, TensorStorage):
             return None
         is_here = device_of_rows(source.storage) == device and source.storage.ndim == 1
-        has_draw = isinstance(source.sampler, GroupSampler) or (
-            isinstance(source.storage, DatasetStorage) and type(source.sampler) is RandomSampler
-        )
-        return cls(source) if is_here and has_draw else None
+        return cls(source) if is_here and _draws_on_cpu(source) else None
 
     def draw(self, size: int) -> TensorDict:
         """Draw the sampler's ``index`` and other information, (B,) each, on the CPU."""
@@ -105,6 +103,12 @@ class IndexedReplay:
             self.replay._sampler = sampler
 
 
+def _draws_on_cpu(replay: TensorDictReplayBuffer) -> bool:
+    """Return whether a buffer's sampler can draw indices on the CPU for rows on a GPU."""
+    is_random = isinstance(replay.storage, DatasetStorage) and type(replay.sampler) is RandomSampler
+    return is_random or isinstance(replay.sampler, GroupSampler)
+
+
 class _GivenRows(RandomSampler):
     """A sampler that returns given indices."""
 
@@ -117,26 +121,20 @@ class _GivenRows(RandomSampler):
 
 def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, size: int) -> None:
     """Raise :class:`ValueError` unless a buffer's minibatches fit the networks and training on them can be resumed."""
-    for network in networks:
+    for network, answered in product(networks, map(plans_of, replay.transform)):
         own = plans_of(network)
-        for answered in map(plans_of, replay.transform):
-            if own is not None and answered is not None and (different := answered.differences(own)):
-                name = "critic" if isinstance(network, Value) else "actor"
-                plans = f"the {name}'s plans, but they differ for {', '.join(different)}"
-                raise ValueError(f"replay's QAFTransform must use {plans}; use QAFTransform({name}.plans)")
+        if own is not None and answered is not None and (different := answered.differences(own)):
+            plans = f"the {'critic' if isinstance(network, Value) else 'actor'}'s plans"
+            raise ValueError(f"replay's QAFTransform must use {plans}, but they differ for {', '.join(different)}")
     if replay._prefetch:
         raise ValueError("replay must not prefetch: prefetched batches would be lost when training resumes")
     if replay.batch_size not in (None, size):
         raise ValueError(f"replay's batch_size must be None or config.batch_size = {size}, got {replay.batch_size}")
-    rows, sampler = replay.storage, replay.sampler
-    if isinstance(sampler, PrioritizedSampler):
+    if isinstance(replay.sampler, PrioritizedSampler):
         raise ValueError("replay must not use a PrioritizedSampler, because the trainers do not update priorities")
-    on_cpu = isinstance(sampler, GroupSampler) or (isinstance(rows, DatasetStorage) and type(sampler) is RandomSampler)
-    if not on_cpu and (device := device_of_rows(rows)).type != "cpu":
-        raise ValueError(
-            f"replay: a {type(sampler).__name__} draws on {device} with a generator that is not saved; use a "
-            "TaskBalancedSampler or CoLearningSampler, or keep the rows on the CPU"
-        )
+    if not _draws_on_cpu(replay) and device_of_rows(replay.storage) != CPU:
+        where = f"{type(replay.sampler).__name__} draws on the GPU with a generator that is not saved"
+        raise ValueError(f"replay: its {where}; use a TaskBalancedSampler, or keep the rows on the CPU")
 
 
 def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:
@@ -147,11 +145,8 @@ def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:
 
 
 def check_augmentations(loss: LossModule, networks: Iterable[nn.Module], replay: TensorDictReplayBuffer) -> None:
-    """Raise :class:`ValueError` if a loss would hide an augmentation's angle or offset from the features.
-
-    TorchRL's losses, except BCLoss, pass on only the ``in_keys`` of a network. These keys do not include the angle and
-    offset that augmentations write, because environments do not write an angle or offset.
-    """
+    """Raise :class:`ValueError` if a loss would hide an augmentation's angle or offset from the features: TorchRL's
+    losses, except BCLoss, pass on only a network's ``in_keys``, which do not include the angle and the offset."""
     kinds = (base for base in type(loss).__mro__ if base not in (LossModule, BCLoss))
     if isinstance(loss, BCLoss) or not any(base.__module__.startswith("torchrl.objectives") for base in kinds):
         return
@@ -159,11 +154,8 @@ def check_augmentations(loss: LossModule, networks: Iterable[nn.Module], replay:
     parts = (part for network in networks for part in network.modules())
     features = [type(part).__name__ for part in parts if isinstance(part, (FocusFeatures, RoleFeatures))]
     if used and features:
-        raise ValueError(
-            f"replay: {features[0]} cannot read the key that {used[0]} writes, because {type(loss).__name__} passes on "
-            f"only the in_keys of a network; leave out {used[0]}, use other features, or train with BCLoss, "
-            "AdvantageWeightedLoss or ExpectileValueLoss"
-        )
+        cause = f"cannot read the key that {used[0]} writes, because {type(loss).__name__} passes on only in_keys"
+        raise ValueError(f"replay: {features[0]} {cause}; leave out {used[0]}, or use other features or another loss")
 
 
 def describe_data(replay: Any) -> dict[str, Any] | None:

@@ -109,10 +109,8 @@ def _copies(name: str) -> list[str]:
 def check_contacts(module: nn.Module) -> None:
     """Raise :class:`ValueError` if role features were not yet fitted to the points where objects are touched."""
     if any(name.endswith("fitted") and not fitted.all() for name, fitted in statistics_of(module).items()):
-        raise ValueError(
-            "RoleFeatures needs contact points from demonstrations; use normalize=True, or call "
-            "lw.training.fit_normalization(actor, replay)"
-        )
+        advice = "use normalize=True, or call lw.training.fit_normalization(actor, replay)"
+        raise ValueError(f"RoleFeatures needs contact points from demonstrations; {advice}")
 
 
 def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
@@ -126,7 +124,5 @@ def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
             for restored, value in before.items():
                 held[restored].copy_(value)
             share_contacts(loss)
-            raise ValueError(
-                "normalize=True would replace the statistics with which a network in the loss was trained; use "
-                "normalize=False, and call fit_normalization(network, replay) for untrained networks"
-            )
+            advice = "use normalize=False, and call fit_normalization(network, replay) for untrained networks"
+            raise ValueError(f"normalize=True would replace the statistics of a trained network; {advice}")

@@ -119,8 +119,9 @@ class OfflineTrainer(Training):
     then updates the target networks. CQL's entry ``loss_actor_bc`` is left out.
 
     Args:
-        loss: a loss from ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator. The networks
-            of the loss are trained in place, on their device.
+        loss: a loss from ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator
+            (``make_value_estimator`` returns None in TorchRL's losses, so call it in a separate statement). The
+            networks of the loss are trained in place, on their device.
         replay: a replay buffer whose samples hold the keys that the loss reads.
         config: hyperparameters; None for the defaults.
         actor: the policy inside the loss, which is written to ``checkpoint``, with the training state next to it; None
@@ -154,7 +155,7 @@ class OfflineTrainer(Training):
     @typed
     def __init__(
         self,
-        loss: Any,  # a LossModule; check_loss explains common mistakes
+        loss: LossModule,
         replay: TensorDictReplayBuffer,
         config: OfflineConfig | None = None,
         *,
@@ -214,31 +215,23 @@ def networks_of(loss: LossModule) -> list[nn.Module]:
     return [network for network in networks if isinstance(network, nn.Module)]
 
 
-def check_loss(loss: Any, replay: TensorDictReplayBuffer) -> None:
+def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
     """Raise an error unless a loss can be trained on a buffer; create TorchRL's default value estimator if missing."""
-    if not isinstance(loss, LossModule):
-        hint = "to compile a loss, call loss.compile()"
-        if loss is None:
-            hint = "TorchRL's make_value_estimator returns None, so call it in a separate statement"
-        raise TypeError(f"loss must be a LossModule, got {type(loss).__name__}; {hint}")
     if getattr(loss, "reduction", "mean") == "none":
         raise ValueError("loss must be reduced to the mean over the rows, got reduction='none'; use reduction='mean'")
     if getattr(loss, "with_lagrange", False):
         raise ValueError("loss: with_lagrange=True keeps loss_cql from training the critics; use with_lagrange=False")
     ahead = [key for key in loss.in_keys if isinstance(key, tuple) and key[0] == "next"]
     if ahead and len(replay) and "next" not in replay.storage[0].keys():
-        lack = f"{type(loss).__name__} requires rewards and next observations, which the rows of replay lack"
-        raise ValueError(f"loss: {lack}; open the buffer with label='executed'")
+        raise ValueError("loss requires next observations, which replay lacks; open the buffer with label='executed'")
     gammas = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
     expected = next(iter(gammas), getattr(replay, "gamma", None))  # None where ``next`` is one step ahead
     if expected is None or loss.default_value_estimator is None:
         return
     gamma = getattr(loss.value_estimator, "gamma", None)
     if gamma is not None and abs(float(gamma) - expected) > 1e-6:
-        raise ValueError(
-            f"loss: the value estimator's gamma must equal the replay buffer's gamma = {expected}, got "
-            f"{float(gamma):.6g}; call loss.make_value_estimator(gamma={expected})"
-        )
+        advice = f"call loss.make_value_estimator(gamma={expected})"
+        raise ValueError(f"loss: gamma must be that of replay, {expected}, got {float(gamma):.6g}; {advice}")
 
 
 def describe_loss(loss: LossModule) -> dict[str, Any]:

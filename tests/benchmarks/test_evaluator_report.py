@@ -1,19 +1,17 @@
-"""Reports on query evaluators: calibration, and drift of conditions."""
+"""Query evaluators: reports of calibration and of the drift of conditions, and plans that are programs."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 
+import benchmarks
 import lw_torchrl as lw
-from benchmarks.evaluator_report import (
-    calibration_error,
-    condition_drift,
-    drift_table,
-    reliability,
-    write_report,
-)
+from benchmarks.evaluator_report import calibration_error, condition_drift, drift_table, reliability, write_report
+from benchmarks.evaluators import load_plans
+from lw_torchrl.transforms.qaf import plan_program
 
 PLANS = lw.Plans({task: lw.load_plans("MT10")[task] for task in ("push", "reach")})
 
@@ -61,3 +59,18 @@ def test_drift_compares_answers_with_the_exact_ones(replay):
         assert drift.agreement == pytest.approx(1.0 - drift.exact)
         assert drift.condition == str(PLANS[drift.task].steps[drift.step].condition)
     assert drifts[0].condition in drift_table(drifts, most=1)
+
+
+TREES = load_plans(str(Path(benchmarks.__file__).parent / "data" / "tree_plans.toml"))
+
+
+def test_programs_of_mt10_have_the_skills_of_the_shipped_plans_and_one_active_step():
+    flat = lw.load_plans("MT10")
+    assert {*TREES} == {*lw.MT10}
+    for task, plan in TREES.items():
+        assert {step.skill for step in plan.steps} == {step.skill for step in flat[task].steps}
+    assert sum(" or " in str(step.condition) for plan in TREES.values() for step in plan.steps) == 7
+    # In these states objects are a few centimetres apart, so most conditions are true in some of them.
+    observation = 0.03 * torch.randn(4000, 39, generator=torch.Generator().manual_seed(0))
+    answers = plan_program(TREES)(observation, torch.tensor([*flat.task_ids.values()]).repeat(400))
+    assert (answers.sum(-1) == 1).all()  # "else" excludes all branches above it, and covers what they leave

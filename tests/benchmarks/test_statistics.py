@@ -1,24 +1,29 @@
-"""Statistics over seeds × tasks: against scipy, by hand, and intervals that contain the truth as often as they
-claim."""
+"""Statistics over seeds × tasks, and summaries of results: against scipy, by hand, and intervals that contain the truth
+as often as they claim."""
 
 import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.stats import mannwhitneyu, t, trim_mean, ttest_ind
 
+import lw_torchrl as lw
 from benchmarks.statistics import (
     Estimate,
+    TaskSummary,
     count_solved,
     interquartile_mean,
     mean_difference,
     mean_over_tasks,
     mean_rate,
     probability_of_improvement,
+    summarize,
+    summarize_rates,
 )
+from lw_torchrl.evaluation import EpisodeResult
 
 TWO = [mean_difference, probability_of_improvement]
 
@@ -90,20 +95,6 @@ def coverage(function, truth, draw, repeats=400):
     return np.mean([estimate.low <= truth <= estimate.high for estimate in estimates])
 
 
-P = np.random.default_rng(0).random(20)
-Q = 0.8 * P
-
-
-@pytest.mark.parametrize("seeds", [3, 5, 20])
-def test_intervals_contain_the_truth_in_95_of_100_cases(seeds):
-    """Also with three seeds. 400 repeats make a standard error of 0.011."""
-    x = lambda rng: rng.binomial(20, P, (seeds, 20)) / 20  # noqa: E731
-    y = lambda rng: rng.binomial(20, Q, (seeds, 20)) / 20  # noqa: E731
-    assert coverage(mean_rate, P.mean(), lambda rng: [x(rng)]) == pytest.approx(0.95, abs=0.03)
-    difference = coverage(mean_difference, (P - Q).mean(), lambda rng: [x(rng), y(rng)])
-    assert difference == pytest.approx(0.95, abs=0.03)
-
-
 @pytest.mark.parametrize("seeds", [1, 3, 5])
 def test_interval_over_tasks_contains_the_mean_over_all_tasks(seeds):
     """Tasks, seeds and the episodes of each are drawn; with one seed, seeds do not differ."""
@@ -123,17 +114,9 @@ def test_interval_over_tasks_of_equal_values_is_that_value():
 
 def test_interval_of_the_probability_of_improvement_contains_the_truth():
     """X is uniform on [0.2, 1], Y on [0, 0.8]: Y is above X with probability 0.75² / 2."""
-    share = coverage(
-        probability_of_improvement,
-        1 - 0.75**2 / 2,
-        lambda rng: [0.2 + 0.8 * rng.random((5, 5)), 0.8 * rng.random((5, 5))],
-        repeats=300,
-    )
+    draw = lambda rng: [0.2 + 0.8 * rng.random((5, 5)), 0.8 * rng.random((5, 5))]  # noqa: E731
+    share = coverage(probability_of_improvement, 1 - 0.75**2 / 2, draw, repeats=300)
     assert share == pytest.approx(0.95, abs=0.04)
-
-
-def test_interval_of_three_seeds():
-    assert str(mean_rate([[0.762], [0.767], [0.790]])) == "0.773 [0.736, 0.810]"
 
 
 def test_tasks_solved_are_counted_at_the_threshold():
@@ -143,6 +126,50 @@ def test_tasks_solved_are_counted_at_the_threshold():
 
 
 def test_estimate_is_text_and_json():
+    assert str(mean_rate([[0.762], [0.767], [0.790]])) == "0.773 [0.736, 0.810]"
     assert str(Estimate(0.5, 0.4, 0.6)) == "0.500 [0.400, 0.600]"
     assert str(mean_rate([[0.5, 1.0]])) == "0.750"
     assert json.loads(json.dumps(mean_rate([[0.5, 1.0]]).to_json())) == {"value": 0.75, "low": None, "high": None}
+
+
+# ---- summaries
+
+
+def make_result(hits, trials=4):
+    """Make a result from the number of successes of each task."""
+    steps = [(task, k, 5 if k < count else None) for task, count in hits.items() for k in range(trials)]
+    episodes = (EpisodeResult(task, k, step is not None, step, None, None) for task, k, step in steps)
+    return lw.EvaluationResult({"tasks": list(hits), "episodes_per_task": trials, "max_steps": 500}, tuple(episodes))
+
+
+RESULTS = {3: make_result({"push": 2, "reach": 4, "sweep": 0}), 7: make_result({"push": 3, "reach": 3, "sweep": 0})}
+
+
+def test_numbers_are_those_computed_by_hand():
+    summary = summarize(RESULTS)
+    assert summary.mean.value == pytest.approx(0.5)
+    assert summary.solved == 1
+    assert summary.per_task["push"] == TaskSummary(mean=0.625, min=0.5, max=0.75)
+    assert summary.by_seed == {"3": 0.5, "7": 0.5}
+    assert summary.array.tolist() == [[0.5, 1.0, 0.0], [0.75, 0.75, 0.0]]
+    assert summary.iqm == interquartile_mean(summary.array)
+    assert summary.mean == mean_rate(summary.array)
+
+
+def rates_by_task(seeds):
+    lists = st.lists(st.floats(0, 1), min_size=seeds, max_size=seeds)
+    return st.dictionaries(st.text(min_size=1, max_size=5), lists, min_size=1, max_size=8)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 4).flatmap(rates_by_task))
+@example({"0": [0.0, 1e-151]})
+def test_summary_is_json_and_consistent(rates):
+    summary = summarize_rates(rates)
+    document = json.loads(json.dumps(summary.to_json(), allow_nan=False))
+    rows = document["tasks"].values()
+    assert {task: row["rates"] for task, row in document["tasks"].items()} == rates
+    assert document["mean"]["value"] == pytest.approx(np.mean([row["mean"] for row in rows]))
+    assert document["mean"]["value"] == pytest.approx(np.mean(list(document["by_seed"].values())))
+    assert all(row["min"] <= row["mean"] + 1e-9 <= row["max"] + 2e-9 for row in rows)
+    assert document["solved"] == sum(row["mean"] >= 0.8 - 1e-9 for row in rows)

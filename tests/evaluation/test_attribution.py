@@ -1,13 +1,14 @@
 """attribute_failures finds planted faults, and reports undecided causes as undecided."""
 
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
-from torch import nn
 
 import lw_torchrl as lw
 from lw_torchrl.evaluation import attribute_failures
@@ -20,19 +21,16 @@ from lw_torchrl.transforms.qaf import plan_program
 
 TASK, SEED, STEPS = "drawer-open", 7, 80
 PLANS = lw.Plans({TASK: lw.load_plans("MT10")[TASK]})
-REFERENCE = {
-    TASK: lw.ConditionalPlan.from_pairs(
-        TASK,
-        [
-            ("gripper is not almost vertically aligned with the drawer handle", PLANS[TASK].steps[0].skill),
-            (
-                "gripper is almost vertically aligned with the drawer handle and gripper is not near the drawer handle",
-                PLANS[TASK].steps[1].skill,
-            ),
-            ("gripper is near the drawer handle", PLANS[TASK].steps[2].skill),
-        ],
-    )
-}
+PROGRAM = plan_program(PLANS)
+PAIRS = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
+ALIGNED = "almost vertically aligned with the drawer handle"
+CONDITIONS = (
+    f"gripper is not {ALIGNED}",
+    f"gripper is {ALIGNED} and gripper is not near the drawer handle",
+    "gripper is near the drawer handle",
+)
+REFERENCE = {TASK: lw.ConditionalPlan.from_pairs(TASK, [*zip(CONDITIONS, [skill for _, skill in PAIRS], strict=True)])}
+DECISIONS = tomllib.loads(Path(__file__).with_name("decisions.toml").read_text("utf-8"))
 RUN = {"seed": SEED, "max_steps": STEPS, "progress": False, "num_threads": 1}
 
 
@@ -51,8 +49,10 @@ def faulty_skill(step=1):
 
 def faulty_plans():
     """A plan that never goes down to the handle."""
-    pairs = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
-    pairs[1] = (pairs[1][0], pairs[0][1])
+    return plans_of([PAIRS[0], (PAIRS[1][0], PAIRS[0][1]), PAIRS[2]])
+
+
+def plans_of(pairs):
     return lw.Plans({TASK: lw.ConditionalPlan.from_pairs(TASK, pairs)})
 
 
@@ -65,12 +65,8 @@ def wrong_answers(tensordict):
 class WrongEvaluator(lw.QueryEvaluator):
     """The same wrong answers, by an evaluator inside a policy."""
 
-    def __init__(self, plans):
-        super().__init__(plans)
-        self.program = plan_program(plans)
-
     def logits(self, observation, task_id):
-        answers = self.program(observation, task_id)
+        answers = PROGRAM(observation, task_id)
         answers[..., 1] ^= True
         return 10.0 * answers.float() - 5.0
 
@@ -82,8 +78,8 @@ def test_a_faulty_skill_is_found_with_its_step():
     [failure] = evaluated(faulty_skill(), reference=REFERENCE).failures
     assert (failure.cause, failure.also, failure.step) == ("skill", None, 1)
     assert failure.counterfactuals == {"no noise": False, "policy": True, "skill": True}
-    assert failure.finding.kind == "distant step"
-    assert failure.finding.values["skill"] == "lower the gripper around the drawer handle"
+    skill = "lower the gripper around the drawer handle"
+    assert (failure.finding.kind, failure.finding.values["skill"]) == ("distant step", skill)
     assert "step 2, 'lower the gripper around the drawer handle', was active" in failure.why.lower()
     assert failure.replaced == "skill"
     assert failure.shares == {"nothing": 0.0, "no noise": 0.0, "policy": 1.0, "skill": 1.0}
@@ -166,11 +162,8 @@ def test_noise_is_told_from_a_fault():
 def test_a_faulty_plan_is_found_with_its_step():
     [failure] = evaluated(lw.ScriptedSkillActor(faulty_plans()), reference=REFERENCE).failures
     assert (failure.cause, failure.step) == ("plan", 1)
-    assert failure.counterfactuals == {"no noise": False, "plan": True}, (
-        "its skills are the scripts, so none is replaced"
-    )
-    assert failure.finding.kind == "plan departs"
-    assert failure.finding.values["step"] == 1
+    assert failure.counterfactuals == {"no noise": False, "plan": True}  # its skills are the scripts: none is replaced
+    assert (failure.finding.kind, failure.finding.values["step"]) == ("plan departs", 1)
     assert failure.finding.values["states"] > 0.5 * failure.finding.values["of"]
 
 
@@ -206,9 +199,7 @@ def test_an_episode_that_no_replacement_repairs_is_undecided():
 
 def test_a_gap_in_the_plan_is_not_a_skills_fault():
     """Where no condition holds, networks attend to all steps: scripts instead of them would hide the gap."""
-    pairs = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
-    plans = lw.Plans({TASK: lw.ConditionalPlan.from_pairs(TASK, pairs[1:])})
-    [failure] = evaluated(still(plans=plans)).failures
+    [failure] = evaluated(still(plans_of(PAIRS[1:]))).failures
     assert failure.cause == "undecided"
     assert failure.evidence["no_condition_late"] == 1.0
 
@@ -224,9 +215,9 @@ class Still(lw.PlanConditionedActor):
         return tensordict.set("action", torch.zeros_like(tensordict["action"]))
 
 
-def still(plans=PLANS):
+def still(plans=PLANS, **options):
     torch.manual_seed(0)
-    return Still(plans, decoder=lw.modules.MLPDecoder(width=8, depth=1))
+    return Still(plans, decoder=lw.modules.MLPDecoder(width=8, depth=1), **options)
 
 
 ENSEMBLE = pytest.param(lambda actor: lw.modules.ActorEnsemble([actor, still()]), marks=pytest.mark.slow)
@@ -246,13 +237,9 @@ def test_a_networks_skills_are_replaced_and_its_mode_stays(wrapped):
 @pytest.mark.parametrize("is_canonical", [False, True])
 def test_a_plan_that_is_not_understood_is_never_called_sound(is_canonical):
     pairs = [("gripper is not near the drawer handle", "dance a waltz"), ("gripper is near the drawer handle", "bow")]
-    plans = lw.Plans({TASK: lw.ConditionalPlan.from_pairs(TASK, pairs)})
-    plans = lw.canonical_plans(plans) if is_canonical else plans
-    parts = {
-        "text_encoder": lambda texts: torch.ones(len(texts), 3),
-        "decoder": lw.modules.MLPDecoder(width=8, depth=1),
-    }
-    [failure] = evaluated(Still(plans, **parts), max_steps=120).failures
+    plans = lw.canonical_plans(plans_of(pairs)) if is_canonical else plans_of(pairs)
+    actor = still(plans, text_encoder=lambda texts: torch.ones(len(texts), 3))
+    [failure] = evaluated(actor, max_steps=120).failures
     assert failure.succeeds_at is not None
     assert "(Meta-World's expert in 2 steps without a scripted skill) the same episode succeeds" in failure.why
     unsound = ", and the expert does not follow the plan, so this does not show that the plan is sound"
@@ -275,17 +262,12 @@ def test_an_evaluator_inside_a_policy_is_replaced_by_exact_answers():
 
 
 def test_a_policy_that_cannot_follow_the_reference_causes_a_warning():
-    class Fixed(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.actor, self.plans = lw.ScriptedSkillActor(faulty_plans()), faulty_plans()
-            self.in_keys, self.out_keys = self.actor.in_keys, self.actor.out_keys
+    class Fixed(lw.ScriptedSkillActor):
+        def with_plans(self, plans):
+            raise ValueError("the plans are fixed")
 
-        def forward(self, tensordict):
-            return self.actor(tensordict)
-
-    with pytest.warns(UserWarning, match="the policy cannot follow the reference"):
-        [failure] = evaluated(Fixed(), reference=REFERENCE, max_steps=20).failures
+    with pytest.warns(UserWarning, match="the policy cannot follow the reference.*the plans are fixed"):
+        [failure] = evaluated(Fixed(faulty_plans()), reference=REFERENCE, max_steps=20).failures
     assert "plan" not in failure.counterfactuals
 
 
@@ -294,8 +276,7 @@ class Completing(lw.ScriptedSkillActor):
 
     def with_plans(self, plans):
         pairs = [(str(step.condition), step.skill) for step in lw.Plans(plans)[TASK].steps]
-        longer = lw.ConditionalPlan.from_pairs(TASK, [*pairs, pairs[0]])
-        return Completing(lw.Plans({TASK: longer}), skills=self._skills)
+        return Completing(plans_of([*pairs, pairs[0]]), skills=self._skills)
 
 
 def test_a_policy_may_complete_the_reference():
@@ -318,27 +299,10 @@ def test_failures_do_not_depend_on_the_number_of_environments():
 # ---- the decision
 
 
-@pytest.mark.parametrize(
-    ("cause", "shares", "null"),
-    [
-        ("query", {"policy": 0.5, "plan": 0.5, "skill": 0.5, "query": 0.5}, 0.0),
-        ("skill", {"policy": 0.5, "skill": 0.5, "time": 0.5}, 0.0),
-        ("skill", {"policy": 0.5, "plan": 0.5, "skill": 0.9}, 0.0),
-        ("policy", {"policy": 0.5, "plan": 1.0}, 0.0),  # scripts that follow the plan succeed, so it is sound
-        ("policy", {"policy": 0.5}, 0.0),
-        ("noise", {"plan": 0.9, "no noise": 1.0}, 0.0),
-        ("noise", {"skill": 0.9, "no noise": 0.9}, 0.0),
-        ("plan", {"plan": 0.9, "no noise": 0.3}, 0.0),
-        ("out of time", {"time": 0.5}, 0.0),
-        ("undecided", {}, 0.0),
-        ("gripper", {"gripper": 0.9, "actuation": 0.2}, 0.0),
-        ("policy", {"gripper": 0.9, "actuation": 0.8, "policy": 1.0}, 0.0),  # no part leads
-        ("skill", {"skill": 1.0, "actuation": 1.0, "policy": 1.0}, 0.0),  # the smallest part
-        ("policy", {"gripper": 0.9}, 0.7),  # hardly better than a plain re-run
-    ],
-)
-def test_the_replacement_that_fixes_most_decides(cause, shares, null):
-    assert decide([*shares], {**shares, "nothing": null})[0] == cause
+@pytest.mark.parametrize("name", DECISIONS)
+def test_the_replacement_that_fixes_most_decides(name):
+    cause, shares = DECISIONS[name]
+    assert decide([name for name in shares if name != "nothing"], {"nothing": 0.0, **shares})[0] == cause
 
 
 def test_two_parts_are_blamed_if_only_both_help():
@@ -375,15 +339,9 @@ def test_a_stay_may_be_interrupted_briefly():
 
 
 def rollout(steps=3, **changed):
-    rollout = TensorDict(
-        {
-            "observation": torch.zeros(steps, 39),
-            "task_id": torch.full((steps,), lw.task_id(TASK)),
-            "episode": torch.zeros(steps, dtype=torch.int64),
-            "next": TensorDict({"success": torch.zeros(steps, 1, dtype=torch.bool)}, [steps]),
-        },
-        [steps],
-    )
+    ids = {"task_id": torch.full((steps,), lw.task_id(TASK)), "episode": torch.zeros(steps, dtype=torch.int64)}
+    success = {"success": torch.zeros(steps, 1, dtype=torch.bool)}
+    rollout = TensorDict({"observation": torch.zeros(steps, 39), **ids, "next": success}, [steps])
     for key, value in changed.items():
         rollout = rollout.exclude(key) if value is None else rollout.set(key, value)
     return rollout
@@ -395,7 +353,7 @@ def rollout(steps=3, **changed):
         ([rollout(observation=None)], "observation"),
         ([rollout(episode=None)], "episode"),
         ([rollout(episode=torch.tensor([0, 0, 1]))], r"rollouts\[0\] must hold one episode"),
-        ([rollout(task_id=torch.zeros(3, dtype=torch.int64))], r"rollouts\[0\] must have one task_id"),
+        ([rollout(task_id=torch.zeros(3, dtype=torch.int64))], r"rollouts\[0\] must hold one episode of"),
         ([rollout(), rollout()], r"rollouts\[1\] repeats episode 0"),
         ([rollout()[0]], r"rollouts\[0\] must be a finished episode"),
     ],
@@ -425,9 +383,8 @@ def test_the_repaired_episode_is_kept_and_can_be_simulated_again():
 
 
 def test_plans_with_memory_are_diagnosed():
-    first = str(PLANS[TASK].steps[0].condition)
-    pairs = [(f"not once ({first})", PLANS[TASK].steps[0].skill), (f"once ({first})", PLANS[TASK].steps[0].skill)]
-    result = evaluated(lw.ScriptedSkillActor(lw.Plans([lw.ConditionalPlan.from_pairs(TASK, pairs)])))
-    (failure,) = result.failures
+    first, skill = PAIRS[0]
+    plans = plans_of([(f"not once ({first})", skill), (f"once ({first})", skill)])
+    [failure] = evaluated(lw.ScriptedSkillActor(plans)).failures
     assert failure.evidence["answers_wrong"] == 0.0  # the latches are those of the episode
     assert failure.evidence["no_condition_late"] == 0.0

@@ -27,22 +27,22 @@ def result():
 
 def test_the_shipped_policy_succeeds():
     actor = lw.load_actor(SHIPPED)
-    assert isinstance(actor, lw.PlanConditionedActor)
-    assert actor.tasks == lw.MT50
+    assert (type(actor), actor.tasks) == (lw.PlanConditionedActor, lw.MT50)
     assert policy_file(SHIPPED).stat().st_size < 2 * 2**20
     run = read_description(SHIPPED)["run"]
     assert (run["setting"], run["preset"], run["seed"]) == ("few-shot", "one-network", 0)
-    tasks = ["button-press", "drawer-close"]
-    result = lw.evaluate(actor, tasks=tasks, episodes_per_task=2, seed=7, stop_at_success=True, progress=False)
-    assert result.mean_success == 1.0
+    options = {"episodes_per_task": 2, "seed": 7, "stop_at_success": True, "progress": False}
+    assert lw.evaluate(actor, tasks=["button-press", "drawer-close"], **options).mean_success == 1.0
     assert actor.stochastic().out_keys[-1] == "action_log_prob"
+
+
+def reaching():
+    return lw.modules.DescriptorConditionedActor("reach", decoder=lw.modules.MLPDecoder(width=8))
 
 
 def test_a_file_with_the_shipped_policys_name_takes_precedence(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    lw.save_actor(
-        lw.modules.DescriptorConditionedActor("reach", decoder=lw.modules.MLPDecoder(width=8)), tmp_path / SHIPPED
-    )
+    lw.save_actor(reaching(), tmp_path / SHIPPED)
     assert lw.load_actor(SHIPPED).tasks == ("reach",)
     with pytest.raises(FileNotFoundError, match="did you mean the shipped policy 'few-shot-mt50'"):
         lw.load_actor("few-shot-mt5")
@@ -74,11 +74,9 @@ def test_the_shipped_policys_card_has_its_own_result_and_citation():
 
 def test_a_policy_without_metadata_has_a_card(result, tmp_path):
     path = tmp_path / "a: [b] 'c.safetensors"
-    member = lw.modules.DescriptorConditionedActor("reach", decoder=lw.modules.MLPDecoder(width=8))
-    lw.save_actor(lw.modules.ActorEnsemble([member, member]), path)
+    lw.save_actor(lw.modules.ActorEnsemble([reaching(), reaching()]), path)
     card = policy_card(path)
-    assert "Not measured." in str(card)
-    assert "`ActorEnsemble` of 2 networks" in str(card)
+    assert all(text in str(card) for text in ("Not measured.", "`ActorEnsemble` of 2 networks"))
     assert card.data.eval_results is None
     with pytest.raises(ValueError, match=r"result .* push"):
         policy_card(path, result)

@@ -1,43 +1,48 @@
-"""EvaluationResult: statistics, tables, failures, and a file that is whole or refused."""
+"""EvaluationResult: statistics, tables, failures, figures, and a file that is whole or refused."""
 
 import json
+import struct
+import sys
+import tomllib
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import reduce
 from hashlib import sha256
+from operator import getitem
+from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mutations import mutated
 
 import lw_torchrl
 from lw_torchrl._util.reproducibility import package_versions
-from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, Failure, plot_failures
+from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, Failure, plot_failures, plot_success
 from lw_torchrl.evaluation.diagnose.failure import Finding
+from lw_torchrl.evaluation.result import wilson_interval
 
 CONFIG = {"tasks": ["push", "reach", "sweep"], "episodes_per_task": 3, "seed": 1, "noise_scale": 0.1}
 CONFIG |= {"stop_at_success": False, "reward": "sparse", "max_steps": 500}
 
 
 def make_result():
-    episodes = [
-        EpisodeResult("push", 0, True, 10, False, 4.0, torch.zeros(500, 4)),
-        EpisodeResult("push", 1, True, 21, True, 480.0),
-        EpisodeResult("push", 2, False, None, False, 0.0),
-        EpisodeResult("reach", 0, True, 1, True, 500.0),
-        EpisodeResult("reach", 1, True, 2, True, 499.0),
-        EpisodeResult("reach", 2, True, 6, True, 495.0),
-        *(EpisodeResult("sweep", k, False, None, False, 0.0) for k in range(3)),
-    ]
-    return EvaluationResult(CONFIG, tuple(episodes))
+    push = [(10, False, 4.0, torch.zeros(500, 4)), (21, True, 480.0), (None, False, 0.0)]
+    reach = [(1, True, 500.0), (2, True, 499.0), (6, True, 495.0)]
+    outcomes = {"push": push, "reach": reach, "sweep": 3 * [(None, False, 0.0)]}
+    return EvaluationResult(CONFIG, episodes(outcomes))
+
+
+def episodes(outcomes):
+    """Return episodes from the first success, the success at the end and the return of each, by task."""
+    numbered = [(task, k, *outcome) for task, listed in outcomes.items() for k, outcome in enumerate(listed)]
+    return tuple(EpisodeResult(task, k, first is not None, first, *rest) for task, k, first, *rest in numbered)
 
 
 def stopped():
     """A result of an evaluation with stop_at_success=True."""
-    episodes = [EpisodeResult("reach", 0, True, 9, None, None), EpisodeResult("reach", 1, False, None, None, None)]
     config = {**CONFIG, "tasks": ["reach"], "episodes_per_task": 2, "stop_at_success": True}
-    return EvaluationResult(config, tuple(episodes))
+    return EvaluationResult(config, episodes({"reach": [(9, None, None), (None, None, None)]}))
 
 
 WRONG = Finding("wrong answers", {"step": 2, "condition": "the gripper is open", "states": 40, "of": 500, "first": 31})
@@ -53,14 +58,10 @@ FAILURES = (
 
 def attributed(failures=FAILURES):
     """A result with the causes of its failures."""
-    episodes = [
-        EpisodeResult("push", 0, False, None, False, 0.0),
-        EpisodeResult("push", 1, False, None, False, 0.0),
-        EpisodeResult("reach", 0, True, 4, True, 496.0),
-        EpisodeResult("reach", 1, False, None, False, 0.0),
-    ]
+    failed = (None, False, 0.0)
     config = {**CONFIG, "tasks": ["push", "reach"], "episodes_per_task": 2}
-    return EvaluationResult(config, tuple(episodes), failures=failures)
+    outcomes = {"push": [failed, failed], "reach": [(4, True, 496.0), failed]}
+    return EvaluationResult(config, episodes(outcomes), failures=failures)
 
 
 # ---- statistics, tables and figures
@@ -111,6 +112,51 @@ def test_the_failure_figure_has_a_bar_for_each_task_that_failed(tmp_path):
         plot_failures(attributed(), tmp_path / "failures.txt")
 
 
+@given(st.integers(1, 1000), st.data())
+def test_the_interval_contains_the_rate_and_is_symmetric(trials, data):
+    successes = data.draw(st.integers(0, trials))
+    low, high = wilson_interval(successes, trials)
+    assert 0 <= low <= successes / trials + 1e-12
+    assert successes / trials - 1e-12 <= high <= 1
+    assert high - low > 0
+    mirrored = wilson_interval(trials - successes, trials)
+    assert (1 - high, 1 - low) == pytest.approx(mirrored, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "expected"),
+    [(8, 10, (0.4902, 0.9433)), (0, 20, (0.0, 0.1611)), (50, 100, (0.4038, 0.5962))],
+)
+def test_the_interval_equals_published_values(successes, trials, expected):
+    assert wilson_interval(successes, trials) == pytest.approx(expected, abs=2e-4)
+
+
+def test_figures_are_written_as_png_and_pdf(tmp_path):
+    path = tmp_path / "runs" / "success.png"
+    plot_success(make_result(), path, title="a title")
+    content = path.read_bytes()
+    assert content[:8] == b"\x89PNG\r\n\x1a\n"
+    assert content[-8:-4] == b"IEND"
+    width, height = struct.unpack(">II", content[16:24])
+    assert min(width / 4, height) > 150
+    plot_success(make_result(), tmp_path / "success.pdf")
+    assert (tmp_path / "success.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_the_bars_are_the_rates_best_on_top():
+    axes = plot_success(make_result()).axes[0]
+    assert [bar.get_width() for bar in axes.patches] == pytest.approx([0.0, 2 / 3, 1.0])
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["sweep", "push", "reach"]
+    assert "0.556" in axes.get_title()
+    assert "of 3;" in axes.get_xlabel()
+
+
+def test_no_window_is_opened_and_no_backend_chosen(monkeypatch):
+    monkeypatch.delitem(sys.modules, "matplotlib.pyplot", raising=False)
+    plot_success(make_result())
+    assert "matplotlib.pyplot" not in sys.modules
+
+
 # ---- files
 
 
@@ -141,68 +187,22 @@ def test_the_file_is_plain_json(tmp_path):
     assert content["episodes"][0] == {"task": "push", "episode": 0, **outcome}
 
 
-def change(**entries):
-    return lambda content: content.update(entries)
+DAMAGE = tomllib.loads(Path(__file__).with_name("damaged_results.toml").read_text("utf-8"))
 
 
-def edit(number, **entries):
-    return lambda content: content["episodes"][number].update(entries)
-
-
-def configure(**entries):
-    return lambda content: content["config"].update(entries)
-
-
-DAMAGE = {
-    "success is 5": edit(0, success=5),
-    "success is 1": edit(0, success=1),
-    "an episode twice": edit(1, episode=0),
-    "a whole episode twice": lambda content: content["episodes"].append(content["episodes"][0]),
-    "a missing episode": lambda content: content["episodes"].pop(),
-    "no episodes": change(episodes=[]),
-    "no tasks and no episodes": lambda content: (content["config"].update(tasks=[]), content.update(episodes=[])),
-    "a negative episode": edit(0, episode=-1),
-    "episode is true": edit(1, episode=True),
-    "an episode of another task": edit(0, task="drawer-open"),
-    "task is a list": edit(0, task=["push"]),
-    "first success is 0": edit(0, first_success=0),
-    "a first success after the end": edit(0, first_success=501),
-    "a first success without success": edit(2, first_success=7),
-    "a success without its first": edit(0, first_success=None),
-    "first success is a float": edit(0, first_success=10.0),
-    "a success only at the end": edit(2, success_at_end=True),
-    "success at the end is a string": edit(0, success_at_end="yes"),
-    "return is a string": edit(0, episode_return="4.0"),
-    "a return of 400 digits": edit(0, episode_return=10**400),
-    "return is nan": edit(0, episode_return=float("nan")),
-    "a task twice in config": lambda content: content["config"]["tasks"].append("push"),
-    "tasks is a string": configure(tasks="push"),
-    "tasks are numbers": configure(tasks=[1, 2]),
-    "other tasks in success_once": lambda content: content["success_once"].pop("push"),
-    "another number of episodes": configure(episodes_per_task=4),
-    "number of episodes is true": configure(episodes_per_task=True),
-    "seed is a string": configure(seed="1"),
-    "negative noise": configure(noise_scale=-0.1),
-    "max_steps is null": configure(max_steps=None),
-    "stop_at_success is a number": configure(stop_at_success=0),
-    "no seed": lambda content: content["config"].pop("seed"),
-    "origin is a string": change(origin="mine"),
-    "version is a list": change(version=[[1]]),
-    "another format": change(format="minari"),
-    "another version": change(version=2),
-    "no config": lambda content: content.pop("config"),
-    "an unknown entry": lambda content: content["episodes"][0].update(colour="red"),
-    "a missing entry": lambda content: content["episodes"][0].pop("success"),
-    "episodes are numbers": change(episodes=[1, 2]),
-    "config is a list": change(config=[]),
-    "a task without episodes": lambda content: content["config"]["tasks"].append("drawer-open"),
-}
-
-
-def damaged_file(path, result, damage):
+def damaged_file(path, result, changes):
+    """Save a result in which entries have other values, as JSON, or are removed."""
     result.save(path)
     content = json.loads(path.read_text())
-    damage(content)
+    for place, value in changes.items():
+        *parents, key = [int(name) if name.isdigit() else name for name in place.split()]
+        node = reduce(getitem, parents, content)
+        if isinstance(node, list):
+            node[key : key + 1] = [json.loads(value)] if value else []
+        elif value:
+            node[key] = json.loads(value)
+        else:
+            node.pop(key, None)
     path.write_text(json.dumps(content))
     return path
 
@@ -219,7 +219,7 @@ def test_a_damaged_file_is_refused_and_left_unchanged(tmp_path, name):
 @pytest.mark.parametrize("failures", [{}, [3], [{}], FAILURES[:2], (*FAILURES, FAILURES[0])])
 def test_there_must_be_one_failure_for_each_failed_episode(tmp_path, failures):
     content = [each.to_json() for each in failures] if isinstance(failures, tuple) else failures
-    path = damaged_file(tmp_path / "results.json", attributed(()), change(failures=content))
+    path = damaged_file(tmp_path / "results.json", attributed(()), {"failures": json.dumps(content)})
     with pytest.raises(ValueError, match=r"[Ff]ailure"):
         EvaluationResult.load(path)
 
@@ -228,17 +228,35 @@ def test_there_must_be_one_failure_for_each_failed_episode(tmp_path, failures):
     "finding", [{"kind": "other", "values": {}}, {"kind": "active step", "values": {"step": 0}}, 3]
 )
 def test_a_finding_without_its_values_is_refused(tmp_path, finding):
-    change_finding = lambda content: content["failures"][1].update(finding=finding)  # noqa: E731
+    change = {"failures 1 finding": json.dumps(finding)}
     with pytest.raises(ValueError, match=r"[Ff]inding|kind"):
-        EvaluationResult.load(damaged_file(tmp_path / "results.json", attributed(), change_finding))
+        EvaluationResult.load(damaged_file(tmp_path / "results.json", attributed(), change))
+
+
+ODD = [0, 1, -1, 2, 0.5, -0.0, 1e300, 2**31, 2**63, -(2**63), 10**400, None, True, False, "", "5", "reach", "raech"]
+ODD += ["x" * 5000, [], [[[[[[]]]]]], [1, 2, 3], ["reach"], ["reach", "reach"], [None], [True], {}, {"a": {"b": {}}}]
+
+
+def places_in(value, path=""):
+    """Return the names of all entries inside a JSON value, as :func:`damaged_file` reads them."""
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [place for key, part in inside for place in (f"{path}{key}", *places_in(part, f"{path}{key} "))]
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    path = damaged_file(tmp_path_factory.mktemp("places") / "results.json", stopped(), {})
+    return [*places_in(json.loads(path.read_text())), "episodes 2", "episodes 0 more"]
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_a_mutated_file_is_refused_or_consistent(tmp_path, data):
+def test_a_mutated_file_is_refused_or_consistent(tmp_path, places, data):
     path = tmp_path / "results.json"
-    stopped().save(path)
-    path.write_text(json.dumps(data.draw(mutated(json.loads(path.read_text())))))
+    changed = data.draw(st.lists(st.sampled_from(places), min_size=1, max_size=3, unique=True))
+    # Change inner entries first, because an outer one may replace or remove them.
+    changed.sort(key=lambda place: -place.count(" "))
+    damaged_file(path, stopped(), {place: data.draw(st.sampled_from(["", *map(json.dumps, ODD)])) for place in changed})
     try:
         result = EvaluationResult.load(path)
     except ValueError:
@@ -281,7 +299,7 @@ def test_the_file_records_its_origin(tmp_path):
     assert loaded.origin["checkpoint"] == {"path": str(checkpoint), "sha256": sha256(b"weights").hexdigest()}
     assert loaded.origin["plans"] == "0123abcd"
     assert loaded == make_result(), "the origin is not compared"
-    damaged_file(tmp_path / "old.json", make_result(), lambda content: content.pop("origin"))
+    damaged_file(tmp_path / "old.json", make_result(), {"origin": ""})
     assert EvaluationResult.load(tmp_path / "old.json").origin == {}
     with pytest.raises(FileNotFoundError, match="nowhere"):
         make_result().save(tmp_path / "other.json", checkpoint=tmp_path / "nowhere.safetensors")

@@ -20,10 +20,8 @@ PLANS = load_plans("MT10")
 
 
 def collect_demos(root):
-    collect_demonstrations(
-        ["push", "reach"], episodes_per_task=2, root=root, max_steps=15, noise_scale=0.2, progress=False
-    )
-    return root
+    options = {"episodes_per_task": 2, "max_steps": 15, "noise_scale": 0.2, "progress": False}
+    return collect_demonstrations(["push", "reach"], root=root, **options).root
 
 
 def make_replay(root, sampler=None):
@@ -91,13 +89,8 @@ def flat(value, path=()):
 
 
 def everything(trainer):
-    state = flat(
-        {
-            "actor": dict(trainer.actor.state_dict()),
-            "optimizer": trainer.optimizer.state_dict(),
-            "minibatches": trainer.minibatches[0].state_dict(),
-        }
-    )
+    minibatches = trainer.minibatches[0].state_dict()
+    state = flat([dict(trainer.actor.state_dict()), trainer.optimizer.state_dict(), minibatches])
     with trainer.minibatches[0].drawing(trainer.device):
         return state | {("next batch",): trainer.replay.sample(8)["observation"]}
 

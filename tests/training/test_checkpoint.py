@@ -7,7 +7,6 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.nn.utils import prune
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -17,7 +16,7 @@ from lw_torchrl._util.reproducibility import package_versions
 from lw_torchrl._util.tensor_files import read_tensors, write_tensors
 from lw_torchrl.language import text
 from lw_torchrl.language.skills import load_skills
-from lw_torchrl.modules import ActorEnsemble, MLPDecoder, ObservationFeatures, SkillEncoder
+from lw_torchrl.modules import ActorEnsemble, MLPDecoder, SkillEncoder
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.training import save_evaluator
 from lw_torchrl.training.checkpoint import read_description
@@ -26,7 +25,6 @@ PLANS = lw.load_plans("MT10")
 
 
 def small(plans=PLANS, **options):
-    """A small actor; the same for :class:`lw.modules.DescriptorConditionedActor`'s tasks."""
     parts = {"skill_encoder": SkillEncoder(4, width=8), "decoder": MLPDecoder(width=16, depth=1)}
     return lw.PlanConditionedActor(plans, **{**parts, **options})
 
@@ -36,16 +34,10 @@ def count_vowels(texts):
 
 
 def make_rows(plans=PLANS, rows=40, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return TensorDict(
-        {
-            "observation": torch.rand(rows, 39, generator=generator),
-            "task_id": torch.tensor([lw.task_id(task) for task in ("push", "reach")]).repeat(rows // 2),
-            "qaf": torch.rand(rows, plans.num_steps, generator=generator) > 0.5,
-            "action": torch.rand(rows, 4, generator=generator) - 0.5,
-        },
-        [rows],
-    )
+    torch.manual_seed(seed)
+    task_id = torch.tensor([lw.task_id(task) for task in ("push", "reach")]).repeat(rows // 2)
+    columns = {"observation": torch.rand(rows, 39), "task_id": task_id, "qaf": torch.rand(rows, plans.num_steps) > 0.5}
+    return TensorDict({**columns, "action": torch.rand(rows, 4) - 0.5}, [rows])
 
 
 def train(actor, path, plans=PLANS):
@@ -80,26 +72,6 @@ def path(tmp_path):
 # ---- the same policy
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        lambda: dict(features=ObservationFeatures("raw")),
-        lambda: dict(features=ObservationFeatures("both", 0.5)),
-        lambda: dict(skill_encoder=SkillEncoder(7, width=5, depth=2), decoder=MLPDecoder(width=9, depth=2)),
-    ],
-)
-def test_load_actor_makes_the_same_policy(path, options):
-    torch.manual_seed(1)
-    actor = train(small(**options()), path)
-    loaded = lw.load_actor(path)
-    assert isinstance(loaded, lw.PlanConditionedActor)
-    assert (loaded.plans, loaded.training, describe(loaded)) == (actor.plans, False, describe(actor))
-    state = make_rows(seed=1).exclude("action")
-    expected, actual = actor.eval()(state.clone()), loaded(state.clone())
-    for key in actor.out_keys:
-        assert torch.equal(actual[key], expected[key])
-
-
 def test_custom_plans_are_stored_and_the_text_encoder_is_passed_again(path):
     actor = train(small(own_plans(), text_encoder=count_vowels), path, own_plans())
     loaded = lw.load_actor(path, text_encoder=count_vowels)
@@ -111,18 +83,12 @@ def test_custom_plans_are_stored_and_the_text_encoder_is_passed_again(path):
             lw.load_actor(path, text_encoder=encoder)
 
 
-CUSTOM_TEXTS = {
-    "a plan": lambda: small(own_plans()),
-    "a description": lambda: lw.modules.DescriptorConditionedActor(
-        [replace(lw.TASKS["reach"], description="Bring the hand over to the red spot.")]
-    ),
-    "an ensemble": lambda: ActorEnsemble([small(own_plans()), small(own_plans())]),
-}
-
-
-@pytest.mark.parametrize("make", CUSTOM_TEXTS.values(), ids=CUSTOM_TEXTS)
-def test_policies_with_texts_that_are_not_shipped_load_in_a_new_process(make, path):
-    lw.save_actor(make(), path)
+@pytest.mark.parametrize("kind", ["ensemble of plans", "description"])
+def test_policies_with_texts_that_are_not_shipped_load_in_a_new_process(kind, path):
+    other = replace(lw.TASKS["reach"], description="Bring the hand over to the red spot.")
+    is_description = kind == "description"
+    actor = lw.modules.DescriptorConditionedActor([other]) if is_description else ActorEnsemble([small(own_plans())])
+    lw.save_actor(actor, path)
     text._sentence_transformer.cache_clear()  # as in a new process
     lw.load_actor(path)
     assert text._sentence_transformer.cache_info().misses
@@ -163,55 +129,26 @@ def test_any_safetensors_reader_reads_the_weights(saved):
 def test_the_description_records_architecture_training_and_versions(saved, path):
     description = read_description(saved[0])
     assert description["actor"] == describe(saved[1])
-    assert description["actor"]["class"] == "PlanConditionedActor"
     assert (description["training"]["steps"], description["data"]) == (5, None)
     lw.save_actor(saved[1], path, note={"mine": [1, 2]})
-    assert read_description(path)["note"] == {"mine": [1, 2]}
-    assert read_description(path)["versions"] == package_versions()
+    description = read_description(path)
+    assert (description["note"], description["versions"]) == ({"mine": [1, 2]}, package_versions())
 
 
 # ---- refused before it is written
 
 
-class NoConfig(nn.Linear):
-    """A network without the attribute config."""
+UNSAVED = {
+    "got torch.float64": lambda network: network.double(),
+    "module.decoder.network.0.weight": lambda network: prune.random_unstructured(network[0], "weight", 0.5),
+    "decoder.network.0.bias must be finite": lambda network: nn.init.constant_(network[0].bias, float("inf")),
+}
 
 
-@pytest.mark.parametrize("network", [nn.Conv1d(39, 4, 1), NoConfig(39, 4)])
-def test_an_actor_that_cannot_be_saved_is_refused_before_training(tmp_path, path, network):
-    module = TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
-    for write in (train, lw.save_actor):
-        with pytest.raises(TypeError, match=f"{type(network).__name__}, which cannot be saved: .* config"):
-            write(module, path)
-    assert not list(tmp_path.iterdir())
-
-
-def pruned(actor):
-    prune.random_unstructured(actor.decoder.network[0], "weight", 0.5)
-    return actor
-
-
-def reconfigured(actor):
-    actor.decoder.network._options["width"] = 32
-    return actor
-
-
-def not_finite(actor):
-    nn.init.constant_(actor.decoder.network[0].bias, float("inf"))
-    return actor
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lw.PlanConditionedActor.double, "got torch.float64"),
-        (pruned, "module.decoder.network.0.weight"),
-        (reconfigured, r"of shape \(32, .*, got torch.float32 of shape \(16, "),
-        (not_finite, "decoder.network.0.bias must be finite"),
-    ],
-)
-def test_an_actor_that_could_not_be_loaded_is_not_saved(tmp_path, path, change, message):
-    actor = change(small())
+@pytest.mark.parametrize("message", UNSAVED)
+def test_an_actor_that_could_not_be_loaded_is_not_saved(tmp_path, path, message):
+    actor = small()
+    UNSAVED[message](actor.decoder.network)
     for write in (lw.save_actor, train):
         with pytest.raises(ValueError, match=f"actor cannot be saved, .*{message}"):
             write(actor, path)
@@ -284,8 +221,5 @@ def test_a_flipped_bit_is_detected(path):
     lw.save_actor(small(), path)
     content = path.read_bytes()
     for place in range(len(content) // 3, len(content), len(content) // 7):
-        damaged = bytearray(content)
-        damaged[place] ^= 0x10
-        path.write_bytes(damaged)
-        with pytest.raises(ValueError, match="is corrupted"):
-            lw.load_actor(path)
+        path.write_bytes(content[:place] + bytes([content[place] ^ 0x10]) + content[place + 1 :])
+        assert_refused(path, "is corrupted")

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_training import assert_same, flat
+from small_training import CONFIG, assert_same, flat, make_actor
+from tensordict.nn import TensorDictSequential
 
 import lw_torchrl as lw
 from lw_torchrl.evaluation import score_evaluator
@@ -19,14 +20,8 @@ PARTS = ("training", "states", "queries", "tasks")
 def replay(tmp_path_factory):
     root = tmp_path_factory.mktemp("states")
     for who in ("scripted", "random"):
-        lw.collect_demonstrations(
-            ["drawer-open", "push", "reach"],
-            episodes_per_task=8,
-            root=root / who,
-            policy=who,
-            max_steps=50,
-            progress=False,
-        )
+        options = {"episodes_per_task": 8, "max_steps": 50, "progress": False}
+        lw.collect_demonstrations(["drawer-open", "push", "reach"], root=root / who, policy=who, **options)
     return lw.LanguageWorldExperienceReplay([root / "scripted", root / "random"], label="executed")
 
 
@@ -51,8 +46,7 @@ def pairs_of(part):
 
 def test_held_out_data_are_not_in_the_training_data(replay):
     config = lw.training.QueryEvaluatorConfig(held_out_tasks=("reach",), held_out_pairs=0.3, seed=3)
-    data = lw.training.LabelledQueries(replay, config)
-    parts = data.parts
+    parts = (data := lw.training.LabelledQueries(replay, config)).parts
     assert (data.tasks, data.held_out_tasks) == (("drawer-open", "push"), ("reach",))
     assert all(parts[part] for part in PARTS)
     assert {queries.task.name for queries in parts["tasks"]} == {"reach"}
@@ -62,14 +56,6 @@ def test_held_out_data_are_not_in_the_training_data(replay):
     assert predicates["queries"] <= predicates["training"]
     states = {part: {tuple(row) for each in parts[part] for row in each.observation.tolist()} for part in PARTS}
     assert states["training"].isdisjoint(states["states"] | states["queries"])
-
-
-def test_the_labels_are_the_exact_answers(replay):
-    queries = lw.training.LabelledQueries(replay, SMALL).parts["training"][0]
-    program = lw.QueryProgram({queries.task: [str(clause) for clause in queries.clauses]})
-    ids = torch.full((len(queries.observation),), lw.task_id(queries.task.name))
-    assert torch.equal(queries.truth, program(queries.observation, ids))
-    assert 0 < queries.truth.float().mean() < 1
 
 
 def test_nothing_need_be_held_out(replay):
@@ -98,8 +84,7 @@ def test_two_tasks_are_learned_quickly(replay):
     lw.training.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
     scores = score_evaluator(evaluator, data).parts
     assert before < 0.7
-    assert scores["states"].accuracy() > 0.98
-    assert scores["states"].balanced_accuracy() > 0.98
+    assert min(scores["states"].accuracy(), scores["states"].balanced_accuracy()) > 0.98
     assert scores["queries"].accuracy() > 0.9
     assert scores["tasks"].accuracy() > 0.87
 
@@ -116,27 +101,19 @@ def test_a_score_counts_every_answer_once(replay, tmp_path):
     assert "held-out queries" in score.table()
 
 
-def test_interrupted_training_resumes_bit_for_bit(replay, tmp_path):
+def test_interrupted_training_resumes_bit_for_bit_and_another_one_is_refused(replay, tmp_path):
     path = tmp_path / "e.safetensors"
     whole = make_trainer(replay)
-    loss = whole.train()
-    first = make_trainer(replay, path)
-    for _ in range(7):
-        first.step()
-    first.save()
+    whole.train()
+    make_trainer(replay, path).train(until=7)
     second = make_trainer(replay, path, seed=1)
     assert second.steps == 7
-    assert second.train() == pytest.approx(loss, abs=1.0)
+    second.train()
     assert_same(everything(second), everything(whole))
     assert make_trainer(replay, path).steps == SMALL.steps
     loaded = lw.training.load_evaluator(path, PLANS)
     assert not loaded.training
     assert_same(flat(dict(loaded.state_dict())), flat(dict(whole.evaluator.state_dict())))
-
-
-def test_a_checkpoint_of_another_training_is_refused(replay, tmp_path):
-    path = tmp_path / "e.safetensors"
-    make_trainer(replay, path).train()
     with pytest.raises(ValueError, match=r"its training differs in .*batch_size"):
         make_trainer(replay, path, config=replace(SMALL, batch_size=32))
     with pytest.raises(ValueError, match=r"its evaluator differs in .*width"):
@@ -149,3 +126,28 @@ def test_an_evaluator_is_loaded_for_any_plans(tmp_path):
     loaded = lw.training.load_evaluator(tmp_path / "e.safetensors", lw.load_plans("MT50"))
     assert loaded.plans.fingerprint == lw.load_plans("MT50").fingerprint
     assert torch.equal(loaded.network.trunk[0].weight, evaluator.network.trunk[0].weight)
+
+
+# ---- imitation that also trains an evaluator
+
+
+def agreement(trainer):
+    rows = trainer.replay[:]
+    exact = lw.QAFTransform(PLANS)(rows.select("observation", "task_id"))["qaf"]
+    with torch.no_grad():
+        return ((trainer.actor[0].logits_of(rows) > 0) == exact).float().mean()
+
+
+def test_the_anchor_keeps_the_answers_exact(demos):
+    replay = lw.LanguageWorldExperienceReplay(demos, sampler=lw.TaskBalancedSampler())
+
+    def trainer(weight):
+        config = replace(CONFIG, qaf_anchor=weight, steps=60)
+        return lw.BehavioralCloningTrainer(TensorDictSequential(make(), make_actor()), replay, config, progress=False)
+
+    free, anchored = trainer(0.0), trainer(1.0)
+    before = agreement(free)
+    for trainer in (free, anchored):
+        trainer.train()
+    assert agreement(anchored) > max(before, agreement(free)) + 0.1
+    assert agreement(anchored) > 0.9

@@ -1,17 +1,17 @@
 """A checkpoint has one writer, and the checkpoint of another training is refused and left unchanged."""
 
 import importlib.metadata
+from dataclasses import replace
 
 import pytest
 import torch
-from small_training import CONFIG, PLANS, make_actor, make_descriptor_actor, make_replay, make_trainer
+from small_training import CONFIG, PLANS, make_actor, make_descriptor_actor, make_trainer
 from torchrl.data import RandomSampler
 from torchrl.envs import Compose
 
 import lw_torchrl as lw
 from lw_torchrl._util.tensor_files import read_tensors, write_tensors
 from lw_torchrl.training.checkpoint import training_file
-from lw_torchrl.training.cloning import bc_loss
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +37,11 @@ def assert_refused(path, message, make):
     assert path.stem in str(caught.value)
 
 
-SMALLER = {task: plan for task, plan in PLANS.items() if task in ("push", "reach")}
 ACTORS = {
     r"width \(16, now 32\)": lambda: make_actor(1, width=32),
-    r"depth \(1, now 2\)": lambda: make_actor(1, depth=2),
     r"latent_size \(4, now 5\)": lambda: make_actor(1, latent_size=5),
     r"kind \('differences', now 'raw'\)": lambda: make_actor(1, kind="raw"),
-    "plans;": lambda: make_actor(plans=SMALLER),
+    "plans;": lambda: make_actor(plans={task: PLANS[task] for task in ("push", "reach")}),
     "class": make_descriptor_actor,
 }
 
@@ -57,21 +55,10 @@ def test_a_checkpoint_of_another_architecture_is_refused(demos, checkpoint, diff
     assert all(torch.equal(value, before[name]) for name, value in actor.state_dict().items())
 
 
-OTHER_VALUES = {
-    "steps": 13,
-    "batch_size": 6,
-    "learning_rate": 1e-3,
-    "loss_function": "l1",
-    "seed": 1,
-    "weight_decay": 0.0,
-}
-
-
-@pytest.mark.parametrize("name", OTHER_VALUES)
-def test_a_checkpoint_of_another_configuration_is_refused(demos, checkpoint, name):
-    config = lw.BehavioralCloningConfig(**{**vars(CONFIG), name: OTHER_VALUES[name]})
-    message = f"a different configuration: its training differs in {name} "
-    assert_refused(checkpoint, message, lambda: make_trainer(demos, checkpoint, config=config))
+def test_a_checkpoint_of_another_configuration_is_refused(demos, checkpoint):
+    values = dict(batch_size=6, learning_rate=1e-3, loss_function="l1", seed=1, steps=13, weight_decay=0.0)
+    message = "a different configuration: its training differs in " + ".* ".join(values)
+    assert_refused(checkpoint, message, lambda: make_trainer(demos, checkpoint, config=replace(CONFIG, **values)))
 
 
 def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
@@ -84,7 +71,6 @@ def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
 @pytest.mark.parametrize(
     ("change", "difference"),
     [
-        (dict(label="executed"), "label"),
         (dict(label="unclipped"), "label"),
         (dict(after_success=0), "rows"),
         (dict(sampler=RandomSampler), "sampler"),
@@ -108,9 +94,8 @@ def test_a_checkpoint_of_other_samples_is_refused(long_demos, tmp_path, change, 
     assert_refused(path, f"a different configuration: its replay differs in {difference}", lambda: trainer(**change))
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not quite", b"years of work\n"])
-def test_a_file_of_another_program_is_refused(demos, tmp_path, content):
-    path, state = tmp_path / "thesis.tex", tmp_path / "thesis.training.tex"
+def test_a_file_of_another_program_is_refused(demos, tmp_path):
+    path, state, content = tmp_path / "thesis.tex", tmp_path / "thesis.training.tex", b"years of work\n"
     path.write_bytes(content)
     assert_refused(path, "exists, but its training state .* does not", lambda: make_trainer(demos, path))
     state.write_bytes(content)
@@ -125,28 +110,9 @@ def test_a_training_file_without_a_state_is_refused(demos, checkpoint, tmp_path)
     assert_refused(training_file(path), "the file holds no valid state", lambda: make_trainer(demos, path))
 
 
-OFFLINE = lw.OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
-EVALUATOR = lw.training.QueryEvaluatorConfig(steps=12, batch_size=8, held_out_pairs=0.0)
-
-
-def offline(demos, path):
-    return lw.OfflineTrainer(bc_loss(make_actor(), "l2"), make_replay(demos), OFFLINE, checkpoint=path, progress=False)
-
-
-def evaluator(demos, path):
-    data = lw.training.LabelledQueries(lw.LanguageWorldExperienceReplay(demos, label="executed"), EVALUATOR)
-    torch.manual_seed(0)
-    network = lw.modules.StateQueryEvaluator(PLANS, width=8, depth=1)
-    return lw.training.QueryEvaluatorTrainer(network, data, EVALUATOR, checkpoint=path, progress=False)
-
-
-TRAINERS = {"cloning": make_trainer, "offline": offline, "evaluator": evaluator}
-
-
-@pytest.mark.parametrize("name", TRAINERS)
-def test_one_training_at_a_time_writes_a_checkpoint(demos, tmp_path, holding, monkeypatch, name):
-    make, path = TRAINERS[name], tmp_path / "policy.safetensors"
-    trainer, late = make(demos, path), make(demos, path)
+def test_one_training_at_a_time_writes_a_checkpoint(demos, tmp_path, holding, monkeypatch):
+    path = tmp_path / "policy.safetensors"
+    trainer, late = make_trainer(demos, path), make_trainer(demos, path)
     release = holding(path)
     with pytest.raises(ValueError, match=f"checkpoint: another training is writing to '{path}'"):
         trainer.train()
@@ -157,13 +123,12 @@ def test_one_training_at_a_time_writes_a_checkpoint(demos, tmp_path, holding, mo
     with pytest.raises(ValueError, match=r"checkpoint: .* was written by another training"):
         late.train()
     assert path.read_bytes() == again
-    files = {"policy.safetensors"} | ({"policy.training.safetensors"} if name != "offline" else set())
-    assert {file.name for file in tmp_path.iterdir()} == files
-    assert make(demos, path).steps == CONFIG.steps
+    assert {file.name for file in tmp_path.iterdir()} == {"policy.safetensors", "policy.training.safetensors"}
+    assert make_trainer(demos, path).steps == CONFIG.steps
     real = importlib.metadata.version
     monkeypatch.setattr(
         "lw_torchrl._util.reproducibility.version", lambda name: "9.9.9" if name == "torch" else real(name)
     )
     with pytest.warns(UserWarning, match=r"with other versions \(torch .*, now 9.9.9\)") as caught:
-        make(demos, path)
+        make_trainer(demos, path)
     assert len(caught) == 1

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._util.checks import Count, Scale, missing_keys, typed
+from lw_torchrl._util.checks import Count, Scale, counted, missing_keys, typed
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, Cause, Failure, Finding
 from lw_torchrl.evaluation.diagnose.replacements import EpisodeId, Scripts
@@ -26,6 +26,7 @@ from lw_torchrl.evaluation.diagnose.states import (
     departures,
     last_active_step,
 )
+from lw_torchrl.evaluation.rollout import actor_plans
 from lw_torchrl.language.canonical import explain_canonical, fallback_plan
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
@@ -109,8 +110,7 @@ def attribute_failures(
     Source: a plan's conditions, skills and skill execution are separate in the policy, so each can be replaced.
     """
     answered = as_plans(plans)
-    if (own := plans_of(actor)) is not None and (other := answered.differences(own)):
-        raise ValueError(f"plans differ from the actor's plans for {', '.join(other)}; pass the actor's plans")
+    actor_plans(actor, answered)  # raises an error if the plans differ from the actor's
     failed = _failed(rollouts, answered)
     if not failed:
         return []
@@ -141,11 +141,10 @@ def _failed(rollouts: Iterable[Any], plans: Plans) -> dict[EpisodeId, TensorDict
         if missing := [str(key) for key in needed if steps.get(key, None) is None]:
             raise missing_keys(steps.keys(True, True), *missing)
         tasks = steps.get("task_id").unique().tolist()
-        if len(tasks) != 1 or tasks[0] not in by_id:
-            raise ValueError(f"{name} must have one task_id, of {', '.join(plans)}, got task_id {tasks}")
         numbers = steps.get("episode").unique().tolist() if number is None else [number]
-        if len(numbers) != 1:
-            raise ValueError(f"{name} must hold one episode, got {len(numbers)} episodes; pass one rollout for each")
+        if len(tasks) != 1 or tasks[0] not in by_id or len(numbers) != 1:
+            got = f"got task_id {tasks} and {counted(len(numbers), 'episode')}"
+            raise ValueError(f"{name} must hold one episode of one of the tasks {', '.join(plans)}, {got}")
         which = by_id[tasks[0]], numbers[0]
         if which in episodes:
             raise ValueError(f"{name} repeats episode {which[1]} of {which[0]!r}; pass each episode once")

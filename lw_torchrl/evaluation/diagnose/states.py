@@ -49,12 +49,9 @@ class Motion(NamedTuple):
         return max(self.errors().values(), default=0.0)
 
     def errors(self) -> dict[int, float]:
-        found = {}
-        for step in self.active.unique().tolist():
-            here = self.active == step
-            if here.sum() >= _BRIEF and self.done.shape[-1]:
-                found[step] = _rms(self.done - self.wanted, here)
-        return found
+        """Return the error of each plan step that was active in 5 states or more."""
+        steps = {step: self.active == step for step in self.active.unique().tolist() if self.done.shape[-1]}
+        return {step: _rms(self.done - self.wanted, here) for step, here in steps.items() if here.sum() >= _BRIEF}
 
     def predicted(self, where: Tensor) -> tuple[str, Tensor]:
         """Return the simplest fault that explains the error in the states ``where`` (T,) bool, and its actions (T, A).

@@ -1,26 +1,68 @@
 """Runs of the paper's experiments: done once, and resumed to the same result."""
 
-import shutil
+import json
+from dataclasses import replace
+from functools import partial
+from unittest.mock import patch
 
 import pytest
-from tiny_runs import (
-    ENSEMBLE,
-    PLANS,
-    PRESET,
-    TINY,
-    TINY_ONE_SHOT,
-    WATCHED,
-    a_run,
-    execute,
-    result_of,
-    stop_training,
-)  # fmt: skip
 
 import lw_torchrl as lw
 from benchmarks.paper import runs
 from benchmarks.paper.imitation import SCRIPTED, ImitationRun
-from benchmarks.paper.recipes import PRESETS, SETTINGS
+from benchmarks.paper.recipes import PRESETS, SETTINGS, DataSetting, Execution, Member
+from benchmarks.paper.stacked import StackedBehavioralCloning
 from lw_torchrl.modules import plans_of
+
+PLANS = lw.load_plans("MT50")
+TINY = DataSetting("tiny", "reach", 2)
+TINY_ONE_SHOT = DataSetting("tiny-one-shot", "reach", 2, targets="push")
+FOCUS = {"focus": True, "canonical": True, "swap_unmentioned": 0.5}
+MEMBER = Member({"features": "differences", "width": 32, "depth": 1}, FOCUS)
+PRESET = replace(
+    PRESETS["strong"]["few-shot"],
+    target=Execution("target", (0.0,)),
+    members=(MEMBER,),
+    training=lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20),
+)
+ROLES = {"features": "opening", "roles": True, "jitter": 0.03, "any_yaw": True}
+OTHER = Member({"features": "relative", "width": 16, "depth": 1, "yaw": 0.3}, ROLES)
+ENSEMBLE = replace(PRESET, name="ensemble", members=(MEMBER, OTHER))
+WATCHED = replace(PRESET, name="watched", evaluations=4)
+
+
+def a_run(method="pcbc", setting=TINY, preset=PRESET):
+    return ImitationRun(setting, method, 3, preset, episodes=2)
+
+
+def execute(run, out):
+    """Execute a run with demonstrations of 100 steps and evaluation episodes of 40."""
+    collect, evaluate = partial(lw.collect_demonstrations, max_steps=100), partial(runs.evaluate, max_steps=40)
+    with patch.multiple(runs, collect_demonstrations=collect, evaluate=evaluate):
+        return runs.execute_run(run, PLANS, out, tasks=run.setting.targets or "reach", progress=False)
+
+
+def result_of(folder):
+    """Return a result's episodes and configuration, without the time it took."""
+    result = json.loads((folder / "results.json").read_text())
+    assert result["config"].pop("seconds") > 0
+    return result["episodes"], result["config"]
+
+
+def stop_training(monkeypatch, setting, at):
+    """Raise KeyboardInterrupt before the at-th training step; return a list with the number of steps so far."""
+    trainer = lw.BehavioralCloningTrainer if setting is TINY else StackedBehavioralCloning
+    step, count = trainer.step, [0]
+
+    def stops(self):
+        count[0] += 1
+        if count[0] == at:
+            raise KeyboardInterrupt
+        return step(self)
+
+    monkeypatch.setattr(trainer, "step", stops)
+    return count
+
 
 RUNS = [
     *(a_run(method) for method in ("pcbc", "dc", "one-hot", SCRIPTED)),
@@ -37,11 +79,6 @@ def undisturbed(tmp_path_factory):
     for run in RUNS:
         execute(run, out)
     return out
-
-
-@pytest.fixture
-def copied(undisturbed, tmp_path):
-    return shutil.copytree(undisturbed, tmp_path / "copied")
 
 
 @by_name
