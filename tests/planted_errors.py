@@ -18,10 +18,7 @@ def collect(root: Path, episodes: int) -> lw.LanguageWorldExperienceReplay:
     plans = lw.load_plans("MT10")
     lw.collect_demonstrations(TASKS, episodes_per_task=episodes, root=root, seed=0)
     return lw.LanguageWorldExperienceReplay(
-        root,
-        batch_size=50,
-        sampler=lw.TaskBalancedSampler(),
-        transform=lw.QAFTransform(plans),
+        root, batch_size=50, sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(plans)
     )
 
 

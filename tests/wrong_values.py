@@ -62,11 +62,7 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
     root = demos.root
     replay = lw.LanguageWorldExperienceReplay(root, batch_size=2, transform=lw.QAFTransform(plans))
     executed = lw.LanguageWorldExperienceReplay(
-        root,
-        batch_size=2,
-        label="executed",
-        terminate_on_success=True,
-        transform=lw.QAFTransform(plans),
+        root, batch_size=2, label="executed", terminate_on_success=True, transform=lw.QAFTransform(plans)
     )
     actor = lw.PlanConditionedActor(plans)
     expert = lw.ExpertActor("reach")

@@ -13,7 +13,6 @@ from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
 from lw_torchrl._util.checks import Count, Natural, Probability, Scale, counted
-from lw_torchrl._util.files import companion
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Maybe, Output, read_evaluator
 
@@ -145,7 +144,7 @@ class Train:
         data = n_step_data = replay(n_steps=N_STEPS, gamma=GAMMA)
         device = place(actor, self.device)
         if self.loss == "advantage":
-            file = companion(self.out, ".value.safetensors", stem=self.out.stem)
+            file = self.out.with_name(f"{self.out.stem}.value.safetensors")
             value: dict[str, Any] = {"checkpoint": file, "title": "training the value"}
             advantage = learn_advantages(plans, n_step_data, config, device, **value)
             data = replay()

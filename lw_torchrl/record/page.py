@@ -80,12 +80,7 @@ class Lanes:
 
 
 def log_lanes(
-    stream: Any,
-    root: str,
-    episode: RecordedEpisode,
-    ended: str,
-    touched: Sequence[str] | None,
-    ghost: Ghost | None,
+    stream: Any, root: str, episode: RecordedEpisode, ended: str, touched: Sequence[str] | None, ghost: Ghost | None
 ) -> Lanes:
     """Log the timeline lanes of an episode below ``root``; ``ended`` is the verdict, and ``touched`` holds the object
     that the fingers touch in each row."""

@@ -26,14 +26,7 @@ from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.text import markdown
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plans import ConditionalPlan
-from lw_torchrl.record.entities import (
-    METRIC_TIMELINE,
-    STEP_TIME,
-    entity_path,
-    rr,
-    send_images,
-    time_columns,
-)
+from lw_torchrl.record.entities import METRIC_TIMELINE, STEP_TIME, entity_path, rr, send_images, time_columns
 from lw_torchrl.record.meshes import LoggedMeshes, Motion
 from lw_torchrl.record.page import send_page
 from lw_torchrl.record.recorded_episode import Ghost, PlanLike, RecordedEpisode

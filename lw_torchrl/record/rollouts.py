@@ -281,11 +281,7 @@ def run_recorded(
         evaluator=evaluator,
         env_options=options,
         keys=_KEYS,
-        optional=[
-            *(_PLAN_KEYS if own_plans is not None else ()),
-            *(learned[0].in_keys if learned else ()),
-            "pixels",
-        ],
+        optional=[*(_PLAN_KEYS if own_plans is not None else ()), *(learned[0].in_keys if learned else ()), "pixels"],
         noise_scale=noise_scale,
         after_success=0 if stop_at_success else None,
         device=device,

@@ -18,8 +18,7 @@ from typing import IO, Any, NamedTuple
 from urllib.parse import quote
 
 from lw_torchrl._util.checks import Natural, typed
-from lw_torchrl._util.files import AnyPath, replacing
-from lw_torchrl._util.limits import run_limited
+from lw_torchrl._util.files import AnyPath, replacing, run_limited
 from lw_torchrl.record.entities import EPISODE_TIMELINE
 from lw_torchrl.record.own_host import LOCAL, START_SECONDS, forwarded, hidden_address
 from lw_torchrl.record.rerun_logger import is_complete

@@ -28,10 +28,7 @@ def test_missing_packages_of_an_extra_are_named(monkeypatch):
 
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
-    [
-        ("find_kernel", lambda: None, "NUMBA_CACHE_DIR"),
-        ("available_cores", lambda: 1, "only one core"),
-    ],
+    [("find_kernel", lambda: None, "NUMBA_CACHE_DIR"), ("available_cores", lambda: 1, "only one core")],
 )
 def test_slow_parts_are_explained(monkeypatch, name, value, sentence):
     monkeypatch.setattr(machine, name, value)

@@ -203,12 +203,7 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
     assert f"lw-torchrl view {out / 'rollout.rrd'}" in printed
 
     policy = (out / "checkpoint.safetensors").read_bytes()
-    kept = [
-        "results.json",
-        "config.json",
-        "demonstrations/metadata.json",
-        "demonstrations/data/action.memmap",
-    ]
+    kept = ["results.json", "config.json", "demonstrations/metadata.json", "demonstrations/data/action.memmap"]
     before = {name: (out / name).stat().st_mtime_ns for name in kept}
     forks.start(*demo, before=shorter)
     status, again, errors = forks.end()

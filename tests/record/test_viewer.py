@@ -16,7 +16,7 @@ import torch
 from recordings import Recording, listens, skip_without_graphics_driver
 from tensordict import TensorDict
 
-from lw_torchrl._util import limits
+from lw_torchrl._util import files
 from lw_torchrl.record import RerunLogger, open_viewer, viewer
 from lw_torchrl.record.viewer import find_recordings, rerun_process
 
@@ -89,7 +89,7 @@ def test_forged_recordings_are_called_damaged(tmp_path, forge):
 
 def test_a_recording_that_is_never_read_to_its_end_is_damaged(tmp_path, monkeypatch):
     path = write(tmp_path / "a.rrd")
-    monkeypatch.setattr(limits, "_SECONDS", 1)
+    monkeypatch.setattr(files, "_SECONDS", 1)
     monkeypatch.setattr(viewer, "_READ", "while True: pass")
     with pytest.raises(ValueError, match=r"a\.rrd' is damaged .*limits of 1 s"):
         open_viewer(path)
