@@ -1,4 +1,4 @@
-"""The examples of docstrings and the Python blocks of README and docs run, and links lead somewhere."""
+"""Examples of docstrings and Python blocks of pages run; links lead somewhere; README is short and cites the paper."""
 
 import doctest
 import importlib
@@ -21,6 +21,7 @@ import lw_torchrl
 
 ROOT = Path(__file__).parent.parent
 FAST_PAGES = {"README.md", "first-plan.md", "how-it-works.md", "reference.md"}
+README = (ROOT / "README.md").read_text("utf-8")
 RESULTS = ROOT / "benchmarks" / "results"
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("**/*.md")), *sorted(RESULTS.glob("*.md"))]
 BLOCK = re.compile(
@@ -129,6 +130,30 @@ def test_every_page_is_in_the_site():
     listed = re.findall(r"^ +- (?:.+: )?(\S+\.md)$", navigation, re.MULTILINE)
     lost = {page.name for page in (ROOT / "docs").glob("*.md")} - set(listed)
     assert not lost, f"add to the nav of mkdocs.yml: {', '.join(sorted(lost))}"
+
+
+def test_readme_has_at_most_700_words():
+    assert len(README.split()) <= 700
+
+
+def test_pictures_of_the_readme_are_small():
+    pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", README)
+    assert "docs/plan.gif" in pictures
+    assert all((ROOT / picture).stat().st_size < 3_000_000 for picture in pictures)
+
+
+def test_citation_names_the_paper():
+    (identifier,) = re.findall(r"arXiv:([\d.]+)", (ROOT / "CITATION.cff").read_text("utf-8"))
+    entry = (ROOT / "lw_torchrl" / "evaluation" / "data" / "citation.bib").read_text("utf-8")
+    assert f"eprint = {{{identifier}}}" in entry
+    assert f"```bibtex\n{entry}```" in README
+
+
+def test_every_picture_of_docs_is_used():
+    pages = [path.read_text("utf-8") for folder in ("docs", "benchmarks") for path in (ROOT / folder).rglob("*.md")]
+    text = "".join([README, *pages])
+    pictures = [path.name for path in (ROOT / "docs").iterdir() if path.suffix in (".png", ".gif", ".svg")]
+    assert not [name for name in pictures if name not in text]
 
 
 class Page(HTMLParser):
