@@ -1,14 +1,15 @@
 """Fixtures of several test files: Meta-World's own environments as the oracle, a plan for every task, MT50."""
 
 import gc
-import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
+from commands import python_process
 from forks import Forks
 
 import lw_torchrl as lw
@@ -82,16 +83,7 @@ def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Forks]:
 def python() -> Callable[..., subprocess.CompletedProcess[str]]:
     """Run a program in a new Python process."""
 
-    def run(program: str, **environment: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-c", program],
-            env={**os.environ, **environment},
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-
-    return run
+    return partial(python_process, "-c", timeout=120)
 
 
 @pytest.fixture

@@ -2,18 +2,17 @@
 
 import ast
 import json
-import os
 import re
 import runpy
 import shlex
 import shutil
-import subprocess
 import sys
 import tempfile
 import tomllib
 from pathlib import Path
 
 import pytest
+from commands import python_process
 from rerun.chunk import RrdReader
 
 import lw_torchrl as lw
@@ -37,14 +36,9 @@ def names(path):
 
 def run(folder, *command):
     """Run Python in a folder and return its standard output."""
-    done = subprocess.run(
-        [sys.executable, *map(str, command)],
-        cwd=folder,
-        env={**os.environ, "TMPDIR": str(folder), "RAY_TMPDIR": tempfile.gettempdir()},  # Ray's sockets: short paths
-        capture_output=True,
-        text=True,
-        timeout=400,
-    )
+    # Ray's sockets need short paths.
+    variables = {"TMPDIR": str(folder), "RAY_TMPDIR": tempfile.gettempdir()}
+    done = python_process(*command, cwd=folder, **variables)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     assert "Warning" not in done.stderr.replace("UserWarning: \x1b", "")  # Gymnasium's, about Meta-World's spaces
@@ -107,8 +101,7 @@ def outputs(notebook):
 @pytest.mark.slow
 def test_tour_runs_from_top_to_bottom(tmp_path):
     pytest.importorskip("nbclient")
-    script = [sys.executable, str(ROOT / "docs" / "hooks" / "tour.py"), "shown.ipynb"]
-    done = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=400)
+    done = python_process(ROOT / "docs" / "hooks" / "tour.py", "shown.ipynb", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert outputs(tmp_path / "shown.ipynb")[0] == outputs(TOUR)[0]
 

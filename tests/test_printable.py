@@ -3,11 +3,10 @@
 import json
 import os
 import re
-import subprocess
-import sys
 from contextlib import suppress
 
 import pytest
+from commands import python_process
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -56,8 +55,7 @@ def test_markdown_has_no_links_or_images(text, around):
 
 
 def run(*args, **variables):
-    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-m", "lw_torchrl", *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, env=os.environ | variables, timeout=200)
+    return python_process("-W", "ignore::DeprecationWarning", "-m", "lw_torchrl", *args, **variables)
 
 
 EVIL = "\x1b]0;owned\x07\x1b[2J"
