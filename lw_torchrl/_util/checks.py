@@ -105,8 +105,8 @@ def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
 
 
 def check_value(argument: str, value: Any, hint: Any) -> Any:
-    """Return ``value`` if it matches a type hint; otherwise raise an :class:`ArgumentError`. NumPy scalars become Python
-    numbers, and "~/" is expanded in a path, and in each path of a list."""
+    """Return ``value`` if it matches a type hint, otherwise raise an :class:`ArgumentError`. NumPy scalars become
+    Python numbers, and "~/" is expanded in paths."""
     if not checker(hint)(value):
         close = did_you_mean(value, re.findall("'(.+?)'", _words(hint)))  # the choices of a Literal
         raise ArgumentError(f"{argument} must be {_words(hint)}, got {shown(value)}{close}")
@@ -201,19 +201,6 @@ def missing_keys(present: Iterable[Any], *needed: str) -> ValueError:
 def counted(number: int, noun: str) -> str:
     """Return a number followed by a noun, which is plural unless the number is 1: "1 task", "50 tasks"."""
     return f"{number} {noun}" + "s" * (number != 1)
-
-
-def differences(was: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """Return the keys whose values differ in two nested mappings, with short values, such as "steps (40, now 30)"."""
-    names = []
-    for key in sorted({**was, **now}):
-        before, after = was.get(key), now.get(key)
-        if isinstance(before, Mapping) and isinstance(after, Mapping):
-            names += differences(before, after, f"{inside}{key}.")
-        elif before != after:
-            values = f"{shown(before)}, now {shown(after)}"
-            names.append(f"{inside}{key}" + (f" ({values})" if len(values) <= 60 else ""))
-    return names
 
 
 _SHORT = Repr()

@@ -138,9 +138,8 @@ def locked(
         lock.acquire(timeout=PATIENCE)
     except Timeout:
         if not wait:
-            kind = "folder" if folder else "file"
-            message = f"another {who} is writing to {str(place)!r}; wait until it finishes, or use a different {kind}"
-            raise error(f"{argument}: {message}") from None
+            remedy = f"wait until it finishes, or use a different {'folder' if folder else 'file'}"
+            raise error(f"{argument}: another {who} is writing to {str(place)!r}; {remedy}") from None
         print(f"waiting for another {who}, which is writing to {str(place)!r}", file=sys.stderr, flush=True)
         lock.acquire()
     try:
@@ -194,16 +193,13 @@ def read_json(path: AnyPath, what: str) -> dict[str, Any]:
 def parse_json(content: bytes) -> dict[str, Any]:
     """Parse JSON text that holds an object; raise a :class:`ValueError` for other values, NaN, infinity and repeated
     keys."""
-    try:
-        value = json.loads(content.decode(), object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite)
-    except RecursionError:
-        raise ValueError("the JSON is nested too deeply") from None
-    if not isinstance(value, dict):
-        raise ValueError(f"the JSON must be an object, got {type(value).__name__}")
     brackets = re.sub(rb'"(?:[^"\\]|\\.)*+"|[^][{}"]++', b"", content)
     steps = (1 if bracket in b"[{" else -1 for bracket in brackets)
-    if max(accumulate(steps)) > _DEEPEST:  # Python can parse such objects, but not write or copy them
+    if max(accumulate(steps), default=0) > _DEEPEST:  # Python cannot write or copy, or even parse, such objects
         raise ValueError("the JSON is nested too deeply")
+    value = json.loads(content.decode(), object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite)
+    if not isinstance(value, dict):
+        raise ValueError(f"the JSON must be an object, got {type(value).__name__}")
     return value
 
 
@@ -221,8 +217,7 @@ def _finite(text: str) -> float:
 
 
 def check_damage(error: Exception) -> None:
-    """Re-raise ``error`` if it was caused by a system limit, such as too many open files, rather than by a damaged
-    file."""
+    """Re-raise ``error`` if a system limit, such as too many open files, caused it, and not a damaged file."""
     expected = (None, errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EINVAL)
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno not in expected):
         raise error
@@ -234,9 +229,8 @@ def reading(path: AnyPath, what: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        raise FileNotFoundError(
-            f"path: {str(path)!r} holds no {what} ({error.filename} is missing); use dumps() to save the {what}"
-        ) from error
+        missing = f"{error.filename} is missing; use dumps() to save the {what}"
+        raise FileNotFoundError(f"path: {str(path)!r} holds no {what} ({missing})") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
         check_damage(error)
         raise ValueError(f"path: {str(path)!r} holds no {what} ({error})") from error
@@ -254,15 +248,10 @@ class LimitError(ValueError):
 
 
 def run_limited(command: Sequence[str | os.PathLike[str]], stored: int) -> subprocess.CompletedProcess[bytes]:
-    """Run a command that reads files of ``stored`` bytes; its time and memory limits grow with ``stored``.
+    """Run a command that reads files of ``stored`` bytes; its time and memory limits grow with ``stored``. Libraries
+    that trust the sizes in a file may allocate gigabytes for a file of a few kilobytes, or never return.
 
-    Libraries that trust the sizes in a file may allocate gigabytes for a file of a few kilobytes, or never return.
-
-    Returns:
-        The command's exit status and output.
-
-    Raises:
-        LimitError: the command took too long, or was killed, for example because it ran out of memory.
+    Raise a :class:`LimitError` if the command took too long or was killed, for example because it ran out of memory.
     """
     seconds, memory = _SECONDS + stored // _BYTES_PER_SECOND, _MEMORY + _MEMORY_PER_BYTE * stored
     environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}

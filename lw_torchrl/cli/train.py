@@ -47,8 +47,7 @@ class Train:
     method: Annotated[str, arg(help=_METHOD)] = "pcbc"
     features: Maybe[Literal["raw", "differences", "relative", "both"]] = None
     """features of the state: raw (the observation), differences (between hand, objects and goal; the default), both, or
-    relative (as differences, but without the hand's height and the gripper opening)
-    """
+    relative (as differences, but without the hand's height and the gripper opening)"""
     width: Maybe[Count] = None  # units of each hidden layer (default: 256)
     depth: Maybe[Natural] = None  # number of hidden layers (default: 3)
     after_success: Natural = 20  # with --loss bc, drop rows more than N time steps after the first success
@@ -340,8 +339,6 @@ class TrainEvaluator:
         for root in roots:
             dataset = read_metadata(root).config
             if not (shared := [task for task in tasks if task in dataset.tasks]):
-                raise ValueError(
-                    f"--data {root} has none of the selected tasks; the dataset has {', '.join(dataset.tasks)}"
-                )
+                raise ValueError(f"--data {root} has none of the selected tasks, only {', '.join(dataset.tasks)}")
             chosen.append(dict.fromkeys(shared, dataset.episodes_per_task))
         return lw.LanguageWorldExperienceReplay(list(roots), label="executed", episodes=chosen)

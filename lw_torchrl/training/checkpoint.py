@@ -13,9 +13,9 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import differences, typed
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import AnyPath, absent_policy, expanded, locked, shipped_policy
-from lw_torchrl._util.reproducibility import LIBRARIES, warn_of_other_versions
+from lw_torchrl._util.reproducibility import LIBRARIES, differences, warn_of_other_versions
 from lw_torchrl._util.tensor_files import AllocationLimit, pop_state, read_tensors, write_tensors
 from lw_torchrl.language.plans import AnyPlans, PlanError, as_plans
 from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
