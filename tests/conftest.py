@@ -52,15 +52,12 @@ def metaworld_env() -> Callable[[str], Any]:
 @pytest.fixture(scope="session")
 def plans() -> dict[str, lw.ConditionalPlan]:
     """A plan for each of the 50 tasks: the shipped one, or one with one to seven supported queries."""
-    shipped = lw.load_plans("MT10")
-    plans = {}
+    plans = dict(lw.load_plans("MT10"))
     for number, task in enumerate(lw.MT50):
         queries = lw.supported_queries(task)
-        steps = 1 + number % 7
-        plans[task] = shipped.get(task) or lw.ConditionalPlan.from_pairs(
-            task, [(queries[(k * 37 + number) % len(queries)], f"move {k}") for k in range(steps)]
-        )
-    return plans
+        pairs = [(queries[(k * 37 + number) % len(queries)], f"move {k}") for k in range(1 + number % 7)]
+        plans.setdefault(task, lw.ConditionalPlan.from_pairs(task, pairs))
+    return {task: plans[task] for task in lw.MT50}
 
 
 @pytest.fixture(scope="session", params=["vectorized", pytest.param("metaworld", marks=pytest.mark.slow)])

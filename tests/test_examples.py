@@ -46,6 +46,7 @@ def run(folder, *command):
 
 
 RUNS = tomllib.loads((Path(__file__).parent / "examples.toml").read_text("utf-8"))
+PRINTS, SAYS = RUNS.pop("parts"), RUNS.pop("extending")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "train_bc.py" else pytest.mark.slow) for n in RUNS])
@@ -108,17 +109,6 @@ def test_tour_runs_from_top_to_bottom(tmp_path):
 
 # ---- examples/parts: each program uses one part of the library
 
-PRINTS = {
-    "custom_decoder": "Linear(in_features=120, out_features=32",
-    "custom_skill_encoder": "torch.Size([1, 3, 16])",
-    "learned_evaluator": "['observation', 'task_id']",
-    "losses": "IQLLoss",
-    "plan_attention": "1.000  lower the gripper around the puck",
-    "qaf_transform": "False",
-    "rerun_logger": "swing",
-    "samplers": "TaskBalancedSampler 10 of 20 rows push",
-}
-
 
 def statements(path):
     """Return the statements of a program, without its docstring."""
@@ -145,13 +135,6 @@ def test_programs_have_at_most_15_lines_use_public_names_and_run(path, tmp_path,
 # ---- examples/extending: the pages link to them and show their commands
 
 TABLES = (METHODS, RELATIONS, SUITES, lw.PLAN_FORMATS)
-SAYS = {
-    "my_method.py": ("trained to step 3", "reach"),
-    "my_evaluator.py": ("trained to step 3", "window-open"),
-    "my_relation.py": ("reach.plan: 2 steps, valid", "is far from"),
-    "my_format.py": ("condition -> skill", "no step: Good luck!"),
-    "my_suite.py": ("ok   desk/hover", "trained to step 3"),
-}
 
 
 def commands(path):

@@ -17,6 +17,7 @@ import lw_torchrl
 
 ROOT = Path(__file__).parent.parent
 BUILD = """
+import sys
 from setuptools import build_meta
 folder = sys.argv[1]  # setuptools writes its own arguments into sys.argv
 build_meta.build_sdist(folder)

@@ -10,9 +10,8 @@ import lw_torchrl as lw
 
 
 def test_prompt_equals_that_of_plan_prompt(capsys):
-    assert run(capsys, "plan", "prompt", "drawer-open", "--format", "chain_py") == lw.planners.plan_prompt(
-        "drawer-open", "chain_py"
-    )
+    printed = run(capsys, "plan", "prompt", "drawer-open", "--format", "chain_py")
+    assert printed == lw.planners.plan_prompt("drawer-open", "chain_py")
     printed = run(capsys, "plan", "prompt", "push", "--format", "goal_md", "--vocabulary", "--plans", "MT50")
     assert printed == lw.planners.plan_prompt("push", "goal_md", vocabulary=True, plans=lw.load_plans("MT50"))
 

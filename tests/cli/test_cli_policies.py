@@ -95,11 +95,9 @@ def test_evaluate_writes_result_figure_and_recording(capsys, policy, tmp_path):
 
 def test_evaluate_records_the_first_failures_of_the_worst_tasks():
     def recorded(**successes):
-        episodes = [
-            lw.evaluation.EpisodeResult(task, number, success, 1 if success else None, success, float(success))
-            for task, each in successes.items()
-            for number, success in enumerate(each)
-        ]
+        numbered = [(task, *each) for task, won in successes.items() for each in enumerate(won)]
+        make = lw.evaluation.EpisodeResult
+        episodes = [make(task, number, won, 1 if won else None, won, float(won)) for task, number, won in numbered]
         return episodes_to_record(lw.EvaluationResult({"tasks": [*successes]}, tuple(episodes)))
 
     outcomes = dict(a=[True, False], b=[True, True], c=[False, False], d=[True, False], e=[False, False])

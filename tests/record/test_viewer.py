@@ -31,14 +31,14 @@ def write(path, steps=20, episodes=1):
     return logger.path
 
 
-@pytest.mark.parametrize(
-    ("output", "message"),
-    [
-        ("thread main panicked at Failed to get render context", "apt-get install libvulkan1 mesa-vulkan-drivers"),
-        ("Error: neither WAYLAND_DISPLAY nor DISPLAY is set.", "--screenshot"),
-        ("something else", "something else"),
-    ],
-)
+REMEDIES = {
+    "thread main panicked at Failed to get render context": "apt-get install libvulkan1 mesa-vulkan-drivers",
+    "Error: neither WAYLAND_DISPLAY nor DISPLAY is set.": "--screenshot",
+    "something else": "something else",
+}
+
+
+@pytest.mark.parametrize(("output", "message"), REMEDIES.items())
 @pytest.mark.parametrize("screenshot", [None, "a.png"])
 def test_error_of_a_failing_viewer_names_the_remedy(tmp_path, monkeypatch, output, message, screenshot):
     write(tmp_path / "a.rrd")
