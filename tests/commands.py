@@ -1,7 +1,10 @@
-"""Run the command line in a test."""
+"""Run the command line in a test, or Python in another process."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +16,12 @@ def run(capsys, *args):
     """Run a command and return what it prints."""
     main([str(arg) for arg in args])
     return capsys.readouterr().out
+
+
+def python_process(*words, cwd=None, timeout=400, **variables):
+    """Run Python with arguments and environment variables; return the ended process with its output."""
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, cwd=cwd, env=os.environ | variables, capture_output=True, text=True, timeout=timeout)
 
 
 def fails(capsys, *args):

@@ -1,14 +1,15 @@
 """Fixtures of several test files: Meta-World's own environments as the oracle, a plan for every task, MT50."""
 
 import gc
-import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
+from commands import python_process
 from forks import Forks
 
 import lw_torchrl as lw
@@ -51,15 +52,12 @@ def metaworld_env() -> Callable[[str], Any]:
 @pytest.fixture(scope="session")
 def plans() -> dict[str, lw.ConditionalPlan]:
     """A plan for each of the 50 tasks: the shipped one, or one with one to seven supported queries."""
-    shipped = lw.load_plans("MT10")
-    plans = {}
+    plans = dict(lw.load_plans("MT10"))
     for number, task in enumerate(lw.MT50):
         queries = lw.supported_queries(task)
-        steps = 1 + number % 7
-        plans[task] = shipped.get(task) or lw.ConditionalPlan.from_pairs(
-            task, [(queries[(k * 37 + number) % len(queries)], f"move {k}") for k in range(steps)]
-        )
-    return plans
+        pairs = [(queries[(k * 37 + number) % len(queries)], f"move {k}") for k in range(1 + number % 7)]
+        plans.setdefault(task, lw.ConditionalPlan.from_pairs(task, pairs))
+    return {task: plans[task] for task in lw.MT50}
 
 
 @pytest.fixture(scope="session", params=["vectorized", pytest.param("metaworld", marks=pytest.mark.slow)])
@@ -82,16 +80,7 @@ def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Forks]:
 def python() -> Callable[..., subprocess.CompletedProcess[str]]:
     """Run a program in a new Python process."""
 
-    def run(program: str, **environment: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-c", program],
-            env={**os.environ, **environment},
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-
-    return run
+    return partial(python_process, "-c", timeout=120)
 
 
 @pytest.fixture

@@ -7,18 +7,15 @@ from torchrl.envs import EnvBase
 
 import lw_torchrl as lw
 
-CONDITIONS = [
-    "the gripper is open",
-    "the gripper is left of the {0}",
-    "the gripper is right of the {0}",
-    "the gripper is not left of the {0}",
-]
-PLANS = lw.Plans(
-    [
-        lw.ConditionalPlan.from_pairs("reach", [(one.format("reach target"), "hold still") for one in CONDITIONS]),
-        lw.ConditionalPlan.from_pairs("push", [(one.format("puck"), "hold still") for one in CONDITIONS[:2]]),
-    ]
-)
+CONDITIONS = ["open", "left of the {0}", "right of the {0}", "not left of the {0}"]
+
+
+def plan(task: str, thing: str, conditions: list[str]) -> lw.ConditionalPlan:
+    pairs = [("the gripper is " + condition.format(thing), "hold still") for condition in conditions]
+    return lw.ConditionalPlan.from_pairs(task, pairs)
+
+
+PLANS = lw.Plans([plan("reach", "reach target", CONDITIONS), plan("push", "puck", CONDITIONS[:2])])
 
 
 class RandomStates(EnvBase):
@@ -30,12 +27,8 @@ class RandomStates(EnvBase):
         ids = torch.tensor([lw.task_id(("push", "reach")[row % 2]) for row in range(rows)])
         self.ids, self.episode, self.at = ids, torch.full((rows,), -1), torch.zeros(rows, dtype=torch.int64)
         flag = Categorical(2, shape=(rows, 1), dtype=torch.bool)
-        self.observation_spec = Composite(
-            observation=Unbounded((rows, 39)),
-            task_id=Unbounded((rows,), dtype=torch.int64),
-            episode=Unbounded((rows,), dtype=torch.int64),
-            shape=(rows,),
-        )
+        numbers = {name: Unbounded((rows,), dtype=torch.int64) for name in ("task_id", "episode")}
+        self.observation_spec = Composite(observation=Unbounded((rows, 39)), **numbers, shape=(rows,))
         self.action_spec = Bounded(-1.0, 1.0, (rows, 4))
         self.reward_spec = Unbounded((rows, 1))
         self.done_spec = Composite(done=flag, terminated=flag.clone(), shape=(rows,))

@@ -1,13 +1,11 @@
 """The benchmarks run, write the tables of benchmarks/results/performance.md, and survive a benchmark that fails."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from commands import python_process
 
 import lw_torchrl as lw
 from benchmarks import __main__ as cli
@@ -23,9 +21,7 @@ FIELDS = {"name", "ours", "unit", "rival", "theirs", "ratio", "spread", "target"
 @pytest.mark.slow
 def test_quick_run_writes_a_table_and_json(tmp_path):
     def run(*options):
-        command = [sys.executable, "-m", "benchmarks", *options, "--out", str(tmp_path)]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
+        done = python_process("-m", "benchmarks", *options, "--out", tmp_path, cwd=ROOT, OMP_NUM_THREADS="1")
         assert done.returncode == 0, done.stderr
         return done.stdout
 

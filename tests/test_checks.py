@@ -133,9 +133,7 @@ def test_annotations_of_checked_functions_can_be_read():
     unread = set()
     for function in checked:
         hints = inspect.getclosurevars(function).nonlocals["read_hints"]()
-        unread |= {
-            function.__annotations__[name] for name in function.__annotations__.keys() - hints.keys() - {"return"}
-        }
+        unread |= {hint for name, hint in function.__annotations__.items() if name not in {*hints, "return"}}
     assert unread <= {"AnyPlans", "Layout", "Layout | None"}
 
 

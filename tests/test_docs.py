@@ -1,26 +1,25 @@
-"""The examples of docstrings and the Python blocks of README and docs run, and links lead somewhere."""
+"""Examples of docstrings and Python blocks of pages run; links lead somewhere; README is short and cites the paper."""
 
 import doctest
 import importlib
 import inspect
 import json
-import os
 import pkgutil
 import re
-import subprocess
-import sys
 import warnings
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from commands import python_process
 from pictures import why_no_pictures
 
 import lw_torchrl
 
 ROOT = Path(__file__).parent.parent
 FAST_PAGES = {"README.md", "first-plan.md", "how-it-works.md", "reference.md"}
+README = (ROOT / "README.md").read_text("utf-8")
 RESULTS = ROOT / "benchmarks" / "results"
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("**/*.md")), *sorted(RESULTS.glob("*.md"))]
 BLOCK = re.compile(
@@ -73,15 +72,15 @@ def test_every_public_class_has_a_docstring():
     assert not [name for name, docstring in classes.items() if not docstring or docstring.startswith(f"{name}(")]
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(page, marks=() if page.name in FAST_PAGES else pytest.mark.slow)
-        for page in PAGES
-        if any(blocks(page))
-    ],
-    ids=lambda page: page.relative_to(ROOT).as_posix(),
-)
+def page_name(page):
+    return page.relative_to(ROOT).as_posix()
+
+
+WITH_CODE = [page for page in PAGES if any(blocks(page))]
+SLOW = [pytest.param(page, marks=pytest.mark.slow) for page in WITH_CODE if page.name not in FAST_PAGES]
+
+
+@pytest.mark.parametrize("page", [*(page for page in WITH_CODE if page.name in FAST_PAGES), *SLOW], ids=page_name)
 def test_code_of_a_page_runs(page):
     namespace = {"__name__": "__main__"}
     for line, kind, code in blocks(page):
@@ -105,7 +104,7 @@ def anchors(page):
     return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
 def test_links_of_pages_lead_somewhere(page):
     text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
     for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?\)", text):
@@ -131,6 +130,30 @@ def test_every_page_is_in_the_site():
     assert not lost, f"add to the nav of mkdocs.yml: {', '.join(sorted(lost))}"
 
 
+def test_readme_has_at_most_700_words():
+    assert len(README.split()) <= 700
+
+
+def test_pictures_of_the_readme_are_small():
+    pictures = re.findall(r"!\[[^\]]+\]\(([^)]+)\)", README)
+    assert "docs/plan.gif" in pictures
+    assert all((ROOT / picture).stat().st_size < 3_000_000 for picture in pictures)
+
+
+def test_citation_names_the_paper():
+    (identifier,) = re.findall(r"arXiv:([\d.]+)", (ROOT / "CITATION.cff").read_text("utf-8"))
+    entry = (ROOT / "lw_torchrl" / "evaluation" / "data" / "citation.bib").read_text("utf-8")
+    assert f"eprint = {{{identifier}}}" in entry
+    assert f"```bibtex\n{entry}```" in README
+
+
+def test_every_picture_of_docs_is_used():
+    pages = [path.read_text("utf-8") for folder in ("docs", "benchmarks") for path in (ROOT / folder).rglob("*.md")]
+    text = "".join([README, *pages])
+    pictures = [path.name for path in (ROOT / "docs").iterdir() if path.suffix in (".png", ".gif", ".svg")]
+    assert not [name for name in pictures if name not in text]
+
+
 class Page(HTMLParser):
     """The links and the anchors of a page of the site."""
 
@@ -149,13 +172,8 @@ class Page(HTMLParser):
 def test_site_is_built_without_warnings_and_its_links_lead_somewhere(tmp_path):
     pytest.importorskip("mkdocs")
     site = tmp_path / "site"
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(site)],
-        cwd=ROOT,
-        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-    )
+    command = ("-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", site)
+    done = python_process(*command, cwd=ROOT, timeout=None, NO_MKDOCS_2_WARNING="1")
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     pages = {path: Page(path) for path in site.rglob("*.html") if path.name != "404.html"}
     assert len(pages) > 50
@@ -174,6 +192,7 @@ def test_site_is_built_without_warnings_and_its_links_lead_somewhere(tmp_path):
     assert {words: found(words, entries) for words in SEARCHES} == SEARCHES
 
 
+# What a user searches for, and the page that must come first; "" is the first page.
 SEARCHES = {
     "GPU": "scaling/",
     "SLURM": "scaling/",
@@ -181,7 +200,6 @@ SEARCHES = {
     "cite": "",
     "custom network": "custom-networks/",
 }
-"""What a user searches for, and the page that must come first; "" is the first page."""
 
 
 def found(words, entries):

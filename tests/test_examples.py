@@ -2,17 +2,17 @@
 
 import ast
 import json
-import os
 import re
 import runpy
 import shlex
 import shutil
-import subprocess
 import sys
 import tempfile
+import tomllib
 from pathlib import Path
 
 import pytest
+from commands import python_process
 from rerun.chunk import RrdReader
 
 import lw_torchrl as lw
@@ -29,101 +29,36 @@ EXTENDING = sorted((EXAMPLES / "extending").glob("my_*.py"))
 
 
 def names(path):
-    """Return every name and attribute in a file, and every module that it imports."""
-    used = set()
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-        if isinstance(node, ast.Attribute):
-            used.add(node.attr)
-        elif isinstance(node, ast.Name):
-            used.add(node.id)
-        elif isinstance(node, ast.ImportFrom):
-            used |= {node.module or "", *(alias.name for alias in node.names)}
-        elif isinstance(node, ast.Import):
-            used |= {alias.name for alias in node.names}
-    return used
+    """Return every name and attribute in a file, and every module and name that it imports."""
+    nodes = list(ast.walk(ast.parse(path.read_text("utf-8"))))
+    return {getattr(node, name) for node in nodes for name in ("attr", "id", "module", "name") if hasattr(node, name)}
 
 
 def run(folder, *command):
     """Run Python in a folder and return its standard output."""
-    done = subprocess.run(
-        [sys.executable, *map(str, command)],
-        cwd=folder,
-        env={
-            **os.environ,
-            "TMPDIR": str(folder),
-            "RAY_TMPDIR": tempfile.gettempdir(),
-        },  # Ray's sockets need short paths
-        capture_output=True,
-        text=True,
-        timeout=400,
-    )
+    # Ray's sockets need short paths.
+    variables = {"TMPDIR": str(folder), "RAY_TMPDIR": tempfile.gettempdir()}
+    done = python_process(*command, cwd=folder, **variables)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     assert "Warning" not in done.stderr.replace("UserWarning: \x1b", "")  # Gymnasium's, about Meta-World's spaces
     return done.stdout
 
 
-ONLINE = ["--task", "button-press-topdown", "--cloning-steps", 150, "--max-steps", 100, "--frames", 2_000]
-ONLINE += ["--learning-starts", 500, "--utd", 0.05, "--episodes", 2, "--out", "out"]
-SUCCESS = "button-press-topdown: success "
-POLICY = "out/button-press-topdown-seed0/policy.safetensors"
-# Options that make an example short; regular expressions that its output has; files that it leaves, if any.
-RUNS = {
-    "train_bc.py": (
-        ["--steps", 20, "--demonstrations", 1, "--episodes", 1],
-        ["step     0  loss", "^drawer-open ", "^window-open ", "^drawer-open: ", "^window-open: "],
-        [],
-    ),
-    "any_environment.py": (["--frames", 500], ["^500 steps, "], None),
-    "plain_pytorch.py": (
-        ["--steps", 500, "--demonstrations", 1, "--episodes", 1],
-        ["step   500  loss", "drawer-open"],
-        None,
-    ),
-    "fetch_few_shot.py": (
-        ["--demonstrations", 1, "--steps", 3, "--episodes", 1],
-        ["seed 0: fetch/pick-and-place"],
-        ["runs/fetch-few-shot/seed0/policy.safetensors"],
-    ),
-    "ppo.py": (
-        ["--updates", 2, "--rows", 4, "--horizon", 20, "--clone", 5],
-        ["update   1  reward", "window-open"],
-        None,
-    ),
-    "online/td3_with_demonstrations.py": ([*ONLINE, "--critic-warm-up", 10], ["step   2000/2000: ", SUCCESS], [POLICY]),
-    "online/sac_with_demonstrations.py": ([*ONLINE, "--critic-warm-up", 10], ["step   2000/2000: ", SUCCESS], [POLICY]),
-    "online/expert_iteration.py": (ONLINE, ["step   2000/2000: ", SUCCESS], [POLICY]),
-    "co_learning.py": (
-        ["--steps", 20, "--demonstrations", 1, "--episodes", 1],
-        ["rows of the target 50$", "^window-open ", "^drawer-open ", "^door-open "],
-        [],
-    ),
-    "offline_rl.py": (
-        ["--steps", 3, "--episodes", 1, "--data", 6],
-        ["^advantage-weighted: ", "^successes cloned:"],
-        [],
-    ),
-    "your_robot/your_robot.py": (
-        ["--steps", 20, "--episodes", 2],
-        ["^arm/touch-red ", "lw-torchrl view runs/arm/arm.rrd"],
-        ["runs/arm/policy.safetensors"],
-    ),
-    "collect_on_ray.py": (["--workers", 2, "--batches", 4], ["batch 3: 200 steps"], None),
-}
+RUNS = tomllib.loads((Path(__file__).parent / "examples.toml").read_text("utf-8"))
+PRINTS, SAYS = RUNS.pop("parts"), RUNS.pop("extending")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "train_bc.py" else pytest.mark.slow) for n in RUNS])
 def test_example_runs(name, tmp_path):
     if name in ("any_environment.py", "fetch_few_shot.py"):
         pytest.importorskip("gymnasium_robotics")
-    options, patterns, files = RUNS[name]
-    output = run(tmp_path, EXAMPLES / name, *options)
-    for pattern in patterns:
-        assert re.search(pattern, output, re.MULTILINE), pattern
-    for file in files or ():
-        assert lw.load_actor(tmp_path / file).tasks
-    if files == []:
+    output = run(tmp_path, EXAMPLES / name, *RUNS[name]["options"].split())
+    assert [pattern for pattern in RUNS[name]["output"] if not re.search(pattern, output, re.MULTILINE)] == []
+    if (file := RUNS[name].get("files")) == "nothing":
         assert not [path for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")]
+    elif file is not None:
+        assert lw.load_actor(tmp_path / file).tasks
 
 
 @pytest.mark.slow
@@ -167,24 +102,12 @@ def outputs(notebook):
 @pytest.mark.slow
 def test_tour_runs_from_top_to_bottom(tmp_path):
     pytest.importorskip("nbclient")
-    script = [sys.executable, str(ROOT / "docs" / "hooks" / "tour.py"), "shown.ipynb"]
-    done = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=400)
+    done = python_process(ROOT / "docs" / "hooks" / "tour.py", "shown.ipynb", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert outputs(tmp_path / "shown.ipynb")[0] == outputs(TOUR)[0]
 
 
 # ---- examples/parts: each program uses one part of the library
-
-PRINTS = {
-    "custom_decoder": "Linear(in_features=120, out_features=32",
-    "custom_skill_encoder": "torch.Size([1, 3, 16])",
-    "learned_evaluator": "['observation', 'task_id']",
-    "losses": "IQLLoss",
-    "plan_attention": "1.000  lower the gripper around the puck",
-    "qaf_transform": "False",
-    "rerun_logger": "swing",
-    "samplers": "TaskBalancedSampler 10 of 20 rows push",
-}
 
 
 def statements(path):
@@ -198,7 +121,7 @@ def test_programs_have_at_most_15_lines_use_public_names_and_run(path, tmp_path,
     lines = "\n".join(map(ast.unparse, statements(path))).splitlines()
     written = [line for line in path.read_text("utf-8").splitlines()[1:] if line.strip()]
     assert max(len(lines), len(written)) <= 15
-    assert {name for name in names(path) if name.startswith("lw_torchrl")} == {"lw_torchrl"}
+    assert {name for name in names(path) if name and name.startswith("lw_torchrl")} == {"lw_torchrl"}
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(path)])
     runpy.run_path(str(path), run_name="__main__")
@@ -212,13 +135,6 @@ def test_programs_have_at_most_15_lines_use_public_names_and_run(path, tmp_path,
 # ---- examples/extending: the pages link to them and show their commands
 
 TABLES = (METHODS, RELATIONS, SUITES, lw.PLAN_FORMATS)
-SAYS = {
-    "my_method.py": ("trained to step 3", "reach"),
-    "my_evaluator.py": ("trained to step 3", "window-open"),
-    "my_relation.py": ("reach.plan: 2 steps, valid", "is far from"),
-    "my_format.py": ("condition -> skill", "no step: Good luck!"),
-    "my_suite.py": ("ok   desk/hover", "trained to step 3"),
-}
 
 
 def commands(path):

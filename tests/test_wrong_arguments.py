@@ -21,13 +21,7 @@ PUBLIC |= {one.__name__: one for one in (lw.language.plans.PlanStep, lw.language
 PUBLIC |= {name: getattr(lw.language.nearest, name) for name in ("nearest_query", "nearest_skill")}
 # The library makes results; a plan checks the types of its steps.
 NOT_MADE_BY_USERS = {
-    "DecodedPlan",
-    "DecodedStep",
-    "EvaluationResult",
-    "Planner",
-    "PlannerError",
-    "PlanError",
-    "QueryError",
+    *["DecodedPlan", "DecodedStep", "EvaluationResult", "Planner", "PlannerError", "PlanError", "QueryError"]
 }
 ALSO_NAMED = {"names": ["tasks?"]}
 NAMESPACE = {name: value for module in MODULES for name, value in vars(module).items()} | PUBLIC
@@ -43,9 +37,8 @@ def is_typed(name):
 
 def arguments_of(name):
     parameters = inspect.signature(function_of(name)).parameters.values()
-    return [
-        one.name for one in parameters if one.name != "self" and one.kind not in (one.VAR_KEYWORD, one.VAR_POSITIONAL)
-    ]
+    several = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+    return [one.name for one in parameters if one.name != "self" and one.kind not in several]
 
 
 def hints_of(name):
@@ -84,9 +77,8 @@ def test_wrong_value_raises_an_error_that_names_the_argument_and_leaves_no_file(
     assert wrong or name not in calls, "add wrong values to OF_ONE_NAME"
     files = sorted(folder.rglob("*"))
     # An error about "reech" in tasks=["reech"] names the task.
-    names = "|".join(
-        [argument, argument.removesuffix("s"), re.sub("ies$", "y", argument), *ALSO_NAMED.get(argument, ())]
-    )
+    singular = [argument.removesuffix("s"), re.sub("ies$", "y", argument)]
+    names = "|".join([argument, *singular, *ALSO_NAMED.get(argument, ())])
     for value in wrong:
         with pytest.raises((TypeError, ValueError), match=rf"\b({names})\b") as raised:
             PUBLIC[name](**{**calls.get(name, {}), argument: value})

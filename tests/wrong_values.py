@@ -55,116 +55,91 @@ OF_ONE_NAME: dict[str, list[Any]] = {
 }
 
 
+# Public names that can be called with nothing but plans, or without arguments.
+PLANS_ONLY = ("CorruptQAF", "PlanConditionedActor", "Plans", "QAFTransform", "QueryEvaluator", "ScriptedSkillActor")
+NO_ARGUMENTS = (
+    "CameraTransform", "EpisodeFilter", "ImageQueryEvaluatorConfig", "QueryEvaluatorConfig", "TaskBalancedSampler",
+    "load_skills",
+)  # fmt: skip
+
+
 def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
     """Arguments with which a public name can be called; a wrong value takes the place of one."""
     plans = lw.Plans({"reach": PLAN})
     demos = lw.collect_demonstrations("reach", episodes_per_task=1, root=folder / "demos", max_steps=3, progress=False)
     root = demos.root
     replay = lw.LanguageWorldExperienceReplay(root, batch_size=2, transform=lw.QAFTransform(plans))
-    executed = lw.LanguageWorldExperienceReplay(
-        root,
-        batch_size=2,
-        label="executed",
-        terminate_on_success=True,
-        transform=lw.QAFTransform(plans),
-    )
+    own: dict[str, Any] = {"label": "executed", "terminate_on_success": True, "transform": lw.QAFTransform(plans)}
+    executed = lw.LanguageWorldExperienceReplay(root, batch_size=2, **own)
     actor = lw.PlanConditionedActor(plans)
     expert = lw.ExpertActor("reach")
     evaluator = lw.modules.StateQueryEvaluator(plans, width=8)
-    images = lw.modules.ImageQueryEvaluator(plans, width=8)
     config = lw.training.QueryEvaluatorConfig(steps=1, batch_size=2, held_out_states=0.0, held_out_pairs=0.0)
     data = lw.training.LabelledQueries(replay, config)
     value = lw.PlanConditionedValue(plans, width=8)
     qvalue = lw.PlanConditionedQValue(plans, width=8)
-    gaussian = actor.stochastic()
     logger = lw.RerunLogger(folder / "pages.rrd")
     env = lw.LanguageWorldEnv("reach", max_steps=3)
     rollout = env.rollout(3, expert)[0]
     env.close()
-    result = lw.evaluate(expert, tasks="reach", episodes_per_task=1, seed=1, max_steps=1, progress=False)
     run = {"tasks": "reach", "episodes_per_task": 1, "seed": 1, "max_steps": 1, "progress": False}
+    short = {"max_steps": 1, "progress": False}
+    result = lw.evaluate(expert, **run)
     episodes: list[Any] = []
     keys = ["observation", "task_id", "qaf", "skill_weights"]
     lw.evaluate(actor, **run, also_record=keys, on_episode=episodes.append)
+    lw.save_actor(actor, folder / "actor.safetensors")
+    lw.training.save_evaluator(evaluator, folder / "asked.safetensors")
+    wide = {"plans": plans, "width": 8}
+    eyes = {"evaluator": lw.modules.ImageQueryEvaluator(**wide), "config": lw.training.ImageQueryEvaluatorConfig()}
+    collected = {"tasks": "reach", "episodes_per_task": 1, "root": folder / "none"}
+    names = ("ImageQueryEvaluator", "PlanConditionedQValue", "PlanConditionedValue", "StateQueryEvaluator")
     return {
+        **{name: {"plans": plans} for name in PLANS_ONLY},
+        **{name: {} for name in NO_ARGUMENTS},
+        **dict.fromkeys(names, wide),
         "ActorEnsemble": {"members": [actor]},
         "AdvantageWeightedLoss": {"actor_network": actor},
         "BehavioralCloningTrainer": {"actor": actor, "replay": replay, "progress": False},
-        "CameraTransform": {},
         "CoLearningSampler": {"target": "reach"},
         "ConditionalPlan": {"task": "reach", "steps": PLAN.steps},
-        "CorruptQAF": {"plans": plans},
-        "DemonstratedSACLoss": {"actor_network": gaussian, "qvalue_network": qvalue},
+        "DemonstratedSACLoss": {"actor_network": actor.stochastic(), "qvalue_network": qvalue},
         "DemonstratedTD3Loss": {"actor_network": actor, "qvalue_network": qvalue},
         "DescriptorConditionedActor": {"tasks": "reach"},
-        "EpisodeFilter": {},
         "ExpectileValueLoss": {"value_network": value},
         "ExpertActor": {"tasks": "reach"},
-        "ImageQueryEvaluator": {"plans": plans, "width": 8},
-        "ImageQueryEvaluatorConfig": {},
-        "ImageQueryEvaluatorTrainer": {
-            "evaluator": images,
-            "data": data,
-            "config": lw.training.ImageQueryEvaluatorConfig(),
-        },
+        "ImageQueryEvaluatorTrainer": {"data": data, **eyes},
         "JitterTarget": {"plans": lw.canonical_plans(plans), "std": 0.03},
         "LabelledQueries": {"replay": replay, "config": config},
         "LanguageWorldEnv": {"tasks": "reach"},
         "LanguageWorldExperienceReplay": {"root": root, "label": "executed"},
         "OfflineTrainer": {"loss": lw.objectives.ExpectileValueLoss(value), "replay": executed, "progress": False},
         "OpenAIPlanner": {"model": "none", "base_url": "http://localhost:1"},
-        "PlanConditionedActor": {"plans": plans},
-        "PlanConditionedQValue": {"plans": plans, "width": 8},
-        "PlanConditionedValue": {"plans": plans, "width": 8},
         "QValue": {"trunk": actor.trunk, "width": 8},
         "Value": {"trunk": actor.trunk, "width": 8},
         "PlanStep": {"condition": PLAN.steps[0].condition, "skill": PLAN.steps[0].skill},
-        "Plans": {"plans": plans},
-        "QAFTransform": {"plans": plans},
-        "QueryEvaluator": {"plans": plans},
-        "QueryEvaluatorConfig": {},
         "QueryEvaluatorTrainer": {"evaluator": evaluator, "data": data, "progress": False},
         "QueryProgram": {"queries": {"reach": ["the robot's gripper is open"]}},
         "RandomYaw": {"scale": 0.1},
         "RolloutRecorder": {"logger": logger},
-        "ScriptedSkillActor": {"plans": plans},
-        "StateQueryEvaluator": {"plans": plans, "width": 8},
         "SwapUnmentioned": {"plans": plans, "probability": 0.5},
         "Task": {"name": "stack", "description": "stack it", "objects": lw.TASKS["reach"].objects},
-        "TaskBalancedSampler": {},
         "add_pictures": {"root": root},
-        "attribute_failures": {
-            "rollouts": episodes,
-            "plans": plans,
-            "actor": actor,
-            "seed": 1,
-            "max_steps": 1,
-            "progress": False,
-        },
+        "attribute_failures": {"rollouts": episodes, "plans": plans, "actor": actor, "seed": 1, **short},
         "canonical_plan": {"plan": PLAN},
         "canonical_plans": {"plans": {"reach": PLAN}},
-        "collect_demonstrations": {
-            "tasks": "reach",
-            "episodes_per_task": 1,
-            "root": folder / "none",
-            "max_steps": 1,
-            "progress": False,
-        },
+        "collect_demonstrations": {**collected, **short},
         "decode_plan": {"text": str(PLAN), "format": "chain_py", "task": "reach"},
         "encode_plan": {"plan": PLAN, "format": "chain_py"},
         "evaluate": {"actor": actor, **run},
         "export_dataset": {"root": root, "format": "lerobot", "out": folder / "none"},
         "import_dataset": {"source": theirs(folder / "theirs"), "out": folder / "none"},
         "from_pretrained": {"source": folder},
-        "load_actor": {"path": lw_saved(lw.save_actor, actor, folder / "actor.safetensors")},
-        "load_evaluator": {
-            "path": lw_saved(lw.training.save_evaluator, evaluator, folder / "asked.safetensors"),
-            "plans": plans,
-        },
+        "load_actor": {"path": folder / "actor.safetensors"},
+        "load_evaluator": {"path": folder / "asked.safetensors", "plans": plans},
         "load_demonstrations": {"root": root},
         "load_pictures": {"replay": replay},
         "load_plans": {"source": "MT10"},
-        "load_skills": {},
         "log_rollout": {"logger": logger, "rollout": rollout},
         "nearest_query": {"text": "the gripper is open", "task": "reach"},
         "nearest_skill": {"text": "reach"},
@@ -188,9 +163,4 @@ def theirs(path: Any) -> Any:
     pq.write_table(pa.table(rows), path / "data" / "file.parquet")
     (path / "meta" / "info.json").write_text('{"codebase_version": "v2.1", "total_frames": 1}')
     (path / "meta" / "tasks.jsonl").write_text('{"task_index": 0, "task": "theirs"}')
-    return path
-
-
-def lw_saved(save: Any, what: Any, path: Any) -> Any:
-    save(what, path)
     return path

@@ -9,7 +9,6 @@ from math import inf
 from numbers import Integral, Real
 from os import PathLike, fspath
 from os.path import expanduser
-from pathlib import Path
 from reprlib import Repr
 from types import SimpleNamespace, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -62,20 +61,18 @@ class ArgumentError(TypeError, ValueError):
 
 def typed(function: Function) -> Function:
     """Decorate a function to check arguments against their annotations, and raise an :class:`ArgumentError` for the
-    first invalid argument.
+    first invalid argument; :func:`check_value` converts the others.
 
-    NumPy scalars are converted to Python numbers. Annotations are evaluated at the first call, so an argument whose
-    type is imported only for type checkers is not checked here. For example, :func:`as_plans` checks ``plans``
-    instead. ``*args`` and ``**kwargs`` are not checked.
+    Annotations are evaluated at the first call. An argument whose type is imported only for type checkers is not
+    checked here (:func:`as_plans` checks ``plans``), nor are ``*args`` and ``**kwargs``.
     """
 
-    def read_hints() -> dict[str, Any]:  # skip the return type, which may come from a package that is not installed
+    def read_hints() -> dict[str, Any]:
         hints: dict[str, Any] = {}
-        for name, hint in function.__annotations__.items():
-            if name != "return":
-                argument = SimpleNamespace(__annotations__={name: hint})
-                with suppress(NameError):
-                    hints |= get_type_hints(argument, function.__globals__, include_extras=True)
+        for name in function.__annotations__.keys() - {"return"}:  # its type may belong to a package that is missing
+            argument = SimpleNamespace(__annotations__={name: function.__annotations__[name]})
+            with suppress(NameError):
+                hints |= get_type_hints(argument, function.__globals__, include_extras=True)
         return hints
 
     return _checked(function, read_hints)
@@ -108,26 +105,19 @@ def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
 
 
 def check_value(argument: str, value: Any, hint: Any) -> Any:
-    """Return ``value`` if it matches a type hint; otherwise raise an :class:`ArgumentError`.
-
-    NumPy scalars are converted to Python numbers. "~/" is expanded in a path, and in each path of a list.
-    """
+    """Return ``value`` if it matches a type hint, otherwise raise an :class:`ArgumentError`. NumPy scalars become
+    Python numbers, and "~/" is expanded in paths."""
     if not checker(hint)(value):
-        choices = [
-            choice for part in (hint, *get_args(hint)) if get_origin(part) is Literal for choice in get_args(part)
-        ]
-        close = did_you_mean(value, map(str, choices)) if isinstance(value, str) else ""
+        close = did_you_mean(value, re.findall("'(.+?)'", _words(hint)))  # the choices of a Literal
         raise ArgumentError(f"{argument} must be {_words(hint)}, got {shown(value)}{close}")
     return _expanded(value) if "PathLike" in str(hint) else _plain(value)
 
 
 def _expanded(value: Any) -> Any:
-    """Expand "~/" at the beginning of a path, or of each path in a list or tuple."""
     if isinstance(value, list | tuple):
         return [*map(_expanded, value)]
-    if isinstance(value, str | PathLike) and fspath(value).startswith("~/"):
-        return expanduser(value) if isinstance(value, str) else Path(expanduser(value))
-    return value
+    is_home = isinstance(value, str | PathLike) and fspath(value).startswith("~/")
+    return type(value)(expanduser(value)) if is_home else value
 
 
 def _plain(value: Any) -> Any:
@@ -136,9 +126,8 @@ def _plain(value: Any) -> Any:
 
 @cache
 def checker(hint: Any) -> Callable[[Any], bool]:
-    """Return a function that checks whether a value matches a type hint. Containers are checked item by item, because
-    beartype checks only one random item, which misses wrong items and advances Python's random generator.
-    """
+    """Return a function that checks whether a value matches a type hint. Containers are checked item by item: beartype
+    checks only one random item, which misses wrong items and advances Python's random generator."""
     kind, parts = get_origin(hint), get_args(hint)
     if kind in (Union, UnionType):
         alternatives = [checker(part) for part in parts]
@@ -178,11 +167,8 @@ def _words(hint: Any) -> str:
 
 
 def check_choice(argument: str, value: Any, allowed: Iterable[str]) -> Any:
-    """Return ``value`` if it is in ``allowed``; otherwise raise a :class:`ValueError` that suggests the closest allowed
-    names.
-    """
-    names = list(allowed)
-    if value not in names:
+    """Return ``value`` if it is in ``allowed``; otherwise raise :func:`unknown_name`."""
+    if value not in (names := list(allowed)):
         raise unknown_name(argument, value, names)
     return value
 
@@ -199,11 +185,8 @@ def check_keys(argument: str, row: Any, allowed: Iterable[str], required: Iterab
 
 def unknown_name(argument: str, value: object, allowed: Iterable[str]) -> ValueError:
     """Return the error for a name that is not in ``allowed``; the message suggests names with a similar spelling."""
-    names = list(allowed)
-    listed = ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "")
-    close = " or ".join(map(repr, nearest(value, names))) if isinstance(value, str) else ""
-    hint = f"; did you mean {close}?" if close else ""
-    return ValueError(f"{argument} must be one of {listed}, got {shown(value)}{hint}")
+    listed = ", ".join(map(repr, (names := list(allowed))[:12])) + (", ..." if len(names) > 12 else "")
+    return ValueError(f"{argument} must be one of {listed}, got {shown(value)}{did_you_mean(value, names, n=3)}")
 
 
 def nearest(value: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
@@ -211,39 +194,23 @@ def nearest(value: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
     return get_close_matches(value, list(allowed), n=n, cutoff=0.4)
 
 
-def did_you_mean(value: str, allowed: Iterable[str]) -> str:
-    """Return the end of an error message that suggests a similar allowed name, or "" if no name is similar."""
-    return "".join(f"; did you mean {name!r}?" for name in nearest(value, allowed, n=1))
+def did_you_mean(value: object, allowed: Iterable[str], *, n: int = 1) -> str:
+    """Return the end of an error message that suggests up to ``n`` similar names, or "" if no name is similar."""
+    close = nearest(value, allowed, n=n) if isinstance(value, str) else ()
+    return f"; did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
 def missing_keys(present: Iterable[Any], *needed: str) -> ValueError:
     """Return the error for a tensordict with the keys ``present`` that lacks some of the ``needed`` keys."""
-    names = [str(key) for key in present]
+    names = [*map(str, present)]
     absent = [key for key in needed if key not in names]
     hint = "; add QAFTransform(plans), which writes qaf, to the environment or buffer" if "qaf" in absent else ""
-    return ValueError(
-        f"the tensordict must have {' and '.join(needed)}, got {', '.join(names)}: {' and '.join(absent)} missing{hint}"
-    )
+    return ValueError(f"the tensordict must have {' and '.join(absent)}, got {', '.join(names)}{hint}")
 
 
 def counted(number: int, noun: str) -> str:
     """Return a number followed by a noun, which is plural unless the number is 1: "1 task", "50 tasks"."""
     return f"{number} {noun}" + "s" * (number != 1)
-
-
-def differences(was: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """Return the keys whose values differ in two nested mappings, with short values, such as "steps (40, now 30)"."""
-    names = []
-    for key in sorted({**was, **now}):
-        before, after = was.get(key), now.get(key)
-        if before == after:
-            continue
-        if isinstance(before, Mapping) and isinstance(after, Mapping):
-            names += differences(before, after, f"{inside}{key}.")
-        else:
-            values = f"{shown(before)}, now {shown(after)}"
-            names.append(f"{inside}{key}" + (f" ({values})" if len(values) <= 60 else ""))
-    return names
 
 
 _SHORT = Repr()

@@ -53,8 +53,7 @@ def asserted(*tensors: Tensor) -> bool:
 
 
 def check_values(holds: Callable[[Tensor], Tensor], tensor: Tensor, problem: str) -> None:
-    """Raise a :class:`ValueError` unless ``holds(tensor)``, a bool scalar, is true. In compiled code or on a GPU, a
-    RuntimeError is raised later instead."""
+    """Raise a :class:`ValueError` unless ``holds(tensor)``; compiled code and GPUs raise a RuntimeError, later."""
     if asserted(tensor):
         torch._assert_async(holds(tensor), problem)
     elif readable(tensor) and not holds(tensor):
@@ -80,17 +79,16 @@ _ALIGNED = 16  # each tensor in a transfer buffer begins at a multiple of this n
 
 
 def check_device(argument: str, value: Any) -> torch.device:
-    """Return a device with an explicit index. ``value`` is a :class:`torch.device`, a PyTorch device name such as
-    "cuda" or "cuda:0", or "auto" for this machine's accelerator (the CPU if there is none). Raise a
-    :class:`ValueError` for an unknown or unavailable device."""
+    """Return a device with an explicit index. ``value`` is a :class:`torch.device`, a name such as "cuda:0", or "auto"
+    for this machine's accelerator (the CPU if there is none). Raise a :class:`ValueError` for any other value."""
     try:
         accelerator = torch.accelerator.current_accelerator(check_available=True)
         device = (accelerator or CPU) if value == "auto" else torch.device(value)
         return CPU if device.type == "cpu" else torch.empty(0, device=device).device
     except (RuntimeError, AssertionError, TypeError) as error:  # PyTorch raises several types, with long messages
         reason = str(error).partition("\n")[0]
-        message = f"{argument} must be 'cpu', 'auto' or a device of this machine, got {shown(value)} ({reason})"
-        raise ValueError(message) from error
+        allowed = f"{argument} must be 'cpu', 'auto' or a device of this machine"
+        raise ValueError(f"{allowed}, got {shown(value)} ({reason})") from error
 
 
 def device_of(module: Any) -> torch.device:

@@ -1,4 +1,4 @@
-"""Read text, JSON and TOML files, write files atomically, and lock a file or folder for one writer."""
+"""Read text, JSON and TOML files, write files atomically, lock them, and run programs that read untrusted files."""
 
 from __future__ import annotations
 
@@ -7,24 +7,23 @@ import glob
 import json
 import os
 import re
-import secrets
 import shutil
 import stat
+import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from hashlib import sha256
 from importlib.resources.abc import Traversable
 from itertools import accumulate
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import IO, Any
+from tempfile import mkdtemp
+from typing import Any
 
 AnyPath = str | os.PathLike[str]
 _ABANDONED = 3600.0  # age in seconds at which a temporary folder counts as a leftover of a killed process
-_LONGEST = 255  # maximum number of bytes in the name of a file, in all common file systems
 _DEEPEST = 200  # maximum nesting of JSON
 PATIENCE = 1.0  # seconds that `locked` waits for another writer to finish
 
@@ -51,63 +50,21 @@ def expanded(path: AnyPath) -> Path:
     return Path(os.path.expanduser(text) if text == "~" or text.startswith("~/") else text)
 
 
-def companion(path: Path, ending: str, *, stem: str | None = None, hidden: bool = False) -> Path:
-    """Return the path in the folder of ``path`` whose name is ``stem`` (by default the name of ``path``) plus
-    ``ending``. If that is too long for a file system, a hash replaces the stem."""
-    name, dot = path.name if stem is None else stem, "." * hidden
-    if len(os.fsencode(dot + name + ending)) > _LONGEST:
-        name = sha256(os.fsencode(name)).hexdigest()[:32]
-    return path.with_name(dot + name + ending)
-
-
 @contextmanager
 def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename the file to ``path`` when the block ends without an error.
 
     If the process is killed, ``path`` is either the complete old file or the complete new file. With ``sync``, which
     takes about 10 ms, the same is true if the machine crashes. The new file has the old file's mode. If ``path`` is a
-    symbolic link, its target is replaced. If it is a device or FIFO, such as /dev/stdout, the content is written to it.
+    symbolic link, its target is replaced. A folder, device or FIFO is not replaced: an :class:`OSError` is raised.
     """
-    target = expanded(path)
-    if _is_stream(target):
-        with TemporaryDirectory() as folder:
-            yield (temporary := Path(folder) / target.name)
-            with temporary.open("rb") as content, _opened(target) as stream:
-                shutil.copyfileobj(content, stream)
-        return
-    with _staged(Path(os.path.realpath(target)), sync) as temporary:
+    target = Path(os.path.realpath(expanded(path)))
+    if target.exists() and not target.is_file():
+        raise OSError(errno.EISDIR if target.is_dir() else errno.EINVAL, "cannot replace this by a file", str(target))
+    with _staged(target, sync) as temporary:
         yield temporary
         if sync:
             flush(temporary)
-
-
-def _opened(stream: Path) -> IO[bytes]:
-    """Open a device or FIFO for writing; raise :class:`OSError` if no reader opens the FIFO within a second."""
-    end = time.monotonic() + PATIENCE
-    while True:
-        try:
-            handle = os.open(stream, os.O_WRONLY | os.O_TRUNC | os.O_NONBLOCK)
-        except OSError as error:
-            if error.errno != errno.ENXIO or time.monotonic() > end:
-                raise
-            time.sleep(0.02)
-        else:
-            os.set_blocking(handle, True)
-            return os.fdopen(handle, "wb")
-
-
-def _is_stream(target: Path) -> bool:
-    """Return whether a path is a device or FIFO; raise :class:`OSError` if a file cannot be written there at all."""
-    try:
-        mode = target.stat().st_mode
-    except FileNotFoundError:
-        return False
-    if stat.S_ISREG(mode):  # a redirected /dev/stdout is a regular file
-        return str(target).startswith(("/dev/std", "/dev/fd/", "/proc/"))
-    if not (stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)):
-        error = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
-        raise OSError(error, os.strerror(error), str(target))
-    return True
 
 
 @contextmanager
@@ -126,9 +83,11 @@ def _staged(target: Path, sync: bool = True) -> Iterator[Path]:
     """Yield a path with the target's name in a private temporary folder, and rename it to ``target`` at the end."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if sync:  # callers use sync=False to write many small files, and listing their folder each time would be slow
-        _remove_abandoned(target)
-    folder = companion(target, f".{secrets.token_hex(8)}.tmp", hidden=True)
-    folder.mkdir(mode=0o700)
+        for left in target.parent.glob(f".{glob.escape(target.name)}.*.tmp"):  # of killed processes
+            with suppress(OSError):
+                if time.time() - left.stat().st_mtime > _ABANDONED:
+                    shutil.rmtree(left)
+    folder = Path(mkdtemp(".tmp", f".{target.name}.", target.parent))
     try:
         yield (temporary := folder / target.name)
         with suppress(FileNotFoundError):
@@ -141,15 +100,6 @@ def _staged(target: Path, sync: bool = True) -> Iterator[Path]:
             flush(target.parent)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _remove_abandoned(target: Path) -> None:
-    """Remove temporary folders that killed processes left behind."""
-    name = companion(target, f".{'0' * 16}.tmp", hidden=True).name
-    for left in target.parent.glob(f"{glob.escape(name.removesuffix('0' * 16 + '.tmp'))}*.tmp"):
-        with suppress(OSError):
-            if time.time() - left.stat().st_mtime > _ABANDONED:
-                shutil.rmtree(left)
 
 
 def flush(path: Path) -> None:
@@ -182,15 +132,14 @@ def locked(
     from filelock import FileLock, Timeout
 
     place = expanded(path)
-    lock = FileLock(place / ".lock" if folder else companion(place, ".lock", hidden=True))
+    lock = FileLock(place / ".lock" if folder else place.with_name(f".{place.name}.lock"))
     Path(lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
     try:
         lock.acquire(timeout=PATIENCE)
     except Timeout:
         if not wait:
-            kind = "folder" if folder else "file"
-            message = f"another {who} is writing to {str(place)!r}; wait until it finishes, or use a different {kind}"
-            raise error(f"{argument}: {message}") from None
+            remedy = f"wait until it finishes, or use a different {'folder' if folder else 'file'}"
+            raise error(f"{argument}: another {who} is writing to {str(place)!r}; {remedy}") from None
         print(f"waiting for another {who}, which is writing to {str(place)!r}", file=sys.stderr, flush=True)
         lock.acquire()
     try:
@@ -244,24 +193,21 @@ def read_json(path: AnyPath, what: str) -> dict[str, Any]:
 def parse_json(content: bytes) -> dict[str, Any]:
     """Parse JSON text that holds an object; raise a :class:`ValueError` for other values, NaN, infinity and repeated
     keys."""
-    try:
-        value = json.loads(content.decode(), object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite)
-    except RecursionError:
-        raise ValueError("the JSON is nested too deeply") from None
-    if not isinstance(value, dict):
-        raise ValueError(f"the JSON must be an object, got {type(value).__name__}")
     brackets = re.sub(rb'"(?:[^"\\]|\\.)*+"|[^][{}"]++', b"", content)
     steps = (1 if bracket in b"[{" else -1 for bracket in brackets)
-    if max(accumulate(steps)) > _DEEPEST:  # Python can parse such objects, but not write or copy them
+    if max(accumulate(steps), default=0) > _DEEPEST:  # Python cannot write or copy, or even parse, such objects
         raise ValueError("the JSON is nested too deeply")
+    value = json.loads(content.decode(), object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite)
+    if not isinstance(value, dict):
+        raise ValueError(f"the JSON must be an object, got {type(value).__name__}")
     return value
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    names = [name for name, _ in pairs]
-    if repeated := [name for name in names if names.count(name) > 1] if len({*names}) < len(names) else []:
-        raise ValueError(f"the JSON has the key {repeated[0][:100]!r} more than once")
-    return dict(pairs)
+    if len(entries := dict(pairs)) < len(pairs):
+        name = Counter(name for name, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the JSON has the key {name[:100]!r} more than once")
+    return entries
 
 
 def _finite(text: str) -> float:
@@ -271,8 +217,7 @@ def _finite(text: str) -> float:
 
 
 def check_damage(error: Exception) -> None:
-    """Re-raise ``error`` if it was caused by a system limit, such as too many open files, rather than by a damaged
-    file."""
+    """Re-raise ``error`` if a system limit, such as too many open files, caused it, and not a damaged file."""
     expected = (None, errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EINVAL)
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno not in expected):
         raise error
@@ -284,9 +229,47 @@ def reading(path: AnyPath, what: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        raise FileNotFoundError(
-            f"path: {str(path)!r} holds no {what} ({error.filename} is missing); use dumps() to save the {what}"
-        ) from error
+        missing = f"{error.filename} is missing; use dumps() to save the {what}"
+        raise FileNotFoundError(f"path: {str(path)!r} holds no {what} ({missing})") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
         check_damage(error)
         raise ValueError(f"path: {str(path)!r} holds no {what} ({error})") from error
+
+
+_MB = 10**6
+# Each limit is a constant plus a multiple of the files' size. The multiple allows for compressed files.
+_SECONDS, _BYTES_PER_SECOND = 30, _MB
+_PATIENCE = 4  # wall-clock limit divided by the CPU-time limit; a process may have to wait for a busy machine
+_MEMORY, _MEMORY_PER_BYTE = 700 * _MB, 200
+
+
+class LimitError(ValueError):
+    """An error for files that a program could not read within its limits."""
+
+
+def run_limited(command: Sequence[str | os.PathLike[str]], stored: int) -> subprocess.CompletedProcess[bytes]:
+    """Run a command that reads files of ``stored`` bytes; its time and memory limits grow with ``stored``. Libraries
+    that trust the sizes in a file may allocate gigabytes for a file of a few kilobytes, or never return.
+
+    Raise a :class:`LimitError` if the command took too long or was killed, for example because it ran out of memory.
+    """
+    seconds, memory = _SECONDS + stored // _BYTES_PER_SECOND, _MEMORY + _MEMORY_PER_BYTE * stored
+    environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}
+    with subprocess.Popen(
+        command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        try:
+            with suppress(ImportError, AttributeError, OSError):  # outside Linux, only the timeout applies
+                import resource
+
+                resource.prlimit(process.pid, resource.RLIMIT_DATA, (memory, memory))
+                resource.prlimit(process.pid, resource.RLIMIT_CPU, (seconds, seconds))
+            output, errors = process.communicate(timeout=_PATIENCE * seconds)
+        except subprocess.TimeoutExpired:
+            output = errors = b""
+        finally:
+            process.kill()
+    if process.returncode < 0:
+        limits = f"{seconds} s and {memory / _MB:,.0f} MB of memory"
+        raise LimitError(f"reading {stored:,} bytes exceeded the limits of {limits}, so it was stopped")
+    return subprocess.CompletedProcess(process.args, process.returncode, output, errors)

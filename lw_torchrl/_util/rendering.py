@@ -17,14 +17,12 @@ _LARGEST = 4096  # pixels along a side
 def check_picture(camera: str, height: int, width: int) -> None:
     """Raise a :class:`ValueError` if the camera is unknown or the height or width is not from 1 to 4096 pixels."""
     check_choice("camera", camera, CAMERAS)
-    for name, size in (("height", height), ("width", width)):
-        if check_value(name, size, Count) > _LARGEST:
-            raise ValueError(f"{name} must be at most {_LARGEST} pixels, got {size}")
+    if max(check_value("height", height, Count), check_value("width", width, Count)) > _LARGEST:
+        raise ValueError(f"height and width must be at most {_LARGEST} pixels, got {height} and {width}")
 
 
 def check_cameras(cameras: str | Sequence[str], height: int, width: int) -> tuple[str, ...]:
-    """Return the camera names as a tuple; raise a :class:`ValueError` if the tuple is empty, a name is unknown or
-    repeated, or the image size is out of range."""
+    """Return the camera names as a tuple; raise an error if it is empty or has an unknown or repeated name."""
     names = (cameras,) if isinstance(cameras, str) else tuple(cameras)
     if not names or len({*names}) < len(names):
         raise ValueError(f"cameras must be one or more distinct names, got {cameras!r}")
@@ -42,7 +40,5 @@ def naming_absent_renderer() -> Iterator[None]:
         backend = os.environ.get("MUJOCO_GL", "").lower()
         if backend not in RENDER_LIBRARIES:
             raise
-        raise ImportError(
-            f"MUJOCO_GL is {backend!r}, but {RENDER_LIBRARIES[backend]} is not installed. Install it, or unset "
-            "MUJOCO_GL: only camera images need it."
-        ) from error
+        remedy = f"install {RENDER_LIBRARIES[backend]}, or unset MUJOCO_GL: only camera images need it"
+        raise ImportError(f"MUJOCO_GL is {backend!r}, but a library is missing; {remedy}") from error

@@ -1,4 +1,4 @@
-"""Reproducibility helpers: episode-specific random generators, and the package versions that results depend on."""
+"""Reproducibility: random generators of episodes, and changes of the settings and versions that results depend on."""
 
 import warnings
 from collections.abc import Iterable, Mapping
@@ -39,6 +39,19 @@ def _installed(name: str) -> str:
     return __version__ if name == "lw_torchrl" else version(name)
 
 
+def differences(was: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
+    """Return the keys whose values differ in two nested mappings, with short values, such as "steps (40, now 30)"."""
+    names = []
+    for key in sorted({**was, **now}):
+        before, after = was.get(key), now.get(key)
+        if isinstance(before, Mapping) and isinstance(after, Mapping):
+            names += differences(before, after, f"{inside}{key}.")
+        elif before != after:
+            values = f"{shown(before)}, now {shown(after)}"
+            names.append(f"{inside}{key}" + (f" ({values})" if len(values) <= 60 else ""))
+    return names
+
+
 def version_changes(recorded: Any, names: Iterable[str]) -> list[str]:
     """Return the packages whose installed version differs from the recorded one, as "mujoco 3.2.0, now 3.3.0"."""
     before = recorded if isinstance(recorded, Mapping) else {}
@@ -48,8 +61,7 @@ def version_changes(recorded: Any, names: Iterable[str]) -> list[str]:
 
 def warn_of_other_versions(path: object, recorded: Any, names: Iterable[str] = LIBRARIES) -> None:
     """Warn if a checkpoint was written with different package versions, in which case training will not resume
-    bit-exactly.
-    """
+    bit-exactly."""
     if changes := version_changes(recorded, names):
         warnings.warn(
             f"checkpoint: {str(path)!r} was written with other versions ({'; '.join(changes)}): training continues, "

@@ -16,22 +16,12 @@ _MARKUP = re.compile(r"[\\`*\[\]<>&|~$#]|(?<=[A-Za-z]):(?=//)|(?<=\b[Ww][Ww][Ww]
 
 
 def printable(text: str) -> str:
-    r"""Replace control characters, such as those of terminal escape sequences, with Python escapes, such as ``\x1b``.
-
-    Example:
-        >>> print(printable("plan\x1b[2J"))
-        plan\x1b[2J
-    """
+    r"""Replace control characters, such as those of escape sequences, with Python escapes, such as ``\x1b``."""
     return _CONTROL.sub(lambda match: match[0].encode("unicode_escape", "surrogatepass").decode(), text)
 
 
 def markdown(text: object) -> str:
-    r"""Convert a text to one line of Markdown that renders as plain text, without links, images, HTML or emphasis.
-
-    Example:
-        >>> print(markdown("![x](http://a.b/c)"))
-        !\[x\](http\://a.b/c)
-    """
+    """Convert a text to one line of Markdown that renders as plain text, without links, images, HTML or emphasis."""
     return _MARKUP.sub(r"\\\g<0>", printable(" ".join(str(text).split())))
 
 

@@ -81,22 +81,13 @@ def spread(
 ) -> Generator[T]:
     """Yield the items of ``run(episodes, on_steps)``, computed for parts of the episodes in worker processes.
 
-    An error in a worker is raised in this process, with a note that lists the part's episodes. A warning in a worker is
-    issued in this process.
+    ``run`` calls ``on_steps`` with the number of new time steps. Workers run a pickled copy for each part of at most
+    ``largest`` episodes, and return the part's items together. An error in a worker is raised in this process, with a
+    note that lists the part's episodes; a warning is issued in this process. ``workers`` is the number of processes; 1
+    runs everything in this process. None means one per core, or this process only if workers would not save time for
+    episodes of ``max_steps`` time steps, if ``run`` cannot be pickled, or if ``alone``.
 
-    Args:
-        run: a function that runs episodes and calls ``on_steps`` with the number of new time steps. Workers run a
-            pickled copy for each part, and return pickled items.
-        episodes: the indices of each task's episodes.
-        workers: number of processes; 1 runs everything in this process. None means one per core, or this process only
-            if starting workers would not save time or ``run`` cannot be pickled.
-        max_steps: maximum number of time steps of an episode.
-        largest: maximum number of episodes in a part. The items of a part arrive together, when it is done.
-        alone: if true, ``workers=None`` means this process only.
-
-    Raises:
-        ValueError: ``run`` cannot be pickled.
-        RuntimeError: a worker was killed.
+    Raise a :class:`ValueError` if ``run`` cannot be pickled, and a :class:`RuntimeError` if a worker was killed.
     """
     time_steps = sum(map(len, episodes.values())) * max_steps
     number = 1 if alone and workers is None else choose_workers(workers, time_steps)

@@ -99,7 +99,7 @@ class Show:
     json: options.Json = False
 
     def run(self) -> Output:
-        from lw_torchrl.data.dataset import read_metadata
+        from lw_torchrl.data.dataset import damaged_episodes, read_metadata
         from lw_torchrl.data.selection import check_behaviours, returns_of
 
         parts = [read_metadata(folder) for folder in self.folders]
@@ -118,8 +118,14 @@ class Show:
             last = group == "behaviour" or len(parts) == 1
             output.table(f"{group}s", rows + [_summary("all", episodes)] * (last and not self.json), _columns(group))
         output.show("all", _summary("all", episodes))
+        damaged = []
+        for part in parts if self.check else ():
+            if number := len(damaged_episodes(part, part.episodes, progress=True)):
+                damaged.append({"folder": part.root, "episodes": number})
+                fault = f"checksum mismatch in {number} of {counted(len(part.episodes), 'episode')}"
+                output.fault = f"{str(part.root)!r} is corrupted: {fault}; delete the folder and collect again"
         if self.check:
-            _check(output, parts)
+            output.show("damaged", damaged, None if damaged else "\nall checksums match")
         return output
 
 
@@ -175,18 +181,6 @@ def _summary(label: str, episodes: list[_Episode]) -> dict[str, Any]:
             "quartiles": quantiles(returns, n=4, method="inclusive") if len(returns) > 1 else returns * 3,
         },
     }
-
-
-def _check(output: Output, parts: list[Demonstrations]) -> None:
-    from lw_torchrl.data.dataset import damaged_episodes
-
-    damaged = []
-    for part in parts:
-        if number := len(damaged_episodes(part, part.episodes, progress=True)):
-            damaged.append({"folder": part.root, "episodes": number})
-            fault = f"checksum mismatch in {number} of {counted(len(part.episodes), 'episode')}"
-            output.fault = f"{str(part.root)!r} is corrupted: {fault}; delete the folder and collect the dataset again"
-    output.show("damaged", damaged, None if damaged else "\nall checksums match")
 
 
 @dataclass(kw_only=True)

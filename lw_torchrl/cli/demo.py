@@ -74,22 +74,15 @@ def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
 
     plans = lw.load_plans("MT10")
     print(f"1/4  collecting {config.demonstrations_per_task} demonstrations for each of {len(config.tasks)} tasks")
-    lw.collect_demonstrations(
-        config.tasks,
-        episodes_per_task=config.demonstrations_per_task,
-        root=out / "demonstrations",
-        seed=config.demonstration_seed,
-        noise_scale=config.demonstration_noise,
-        noise_hold=config.noise_hold,
-        redraw_failures=True,
-    )
+    how: dict[str, Any] = {"noise_scale": config.demonstration_noise, "noise_hold": config.noise_hold}
+    how |= {"episodes_per_task": config.demonstrations_per_task, "seed": config.demonstration_seed}
+    lw.collect_demonstrations(config.tasks, root=out / "demonstrations", redraw_failures=True, **how)
     print(f"2/4  training a plan-conditioned policy for {config.training_steps} steps")
     torch.manual_seed(config.training_seed)
     actor = lw.PlanConditionedActor(plans)
     rows: dict[str, Any] = {"after_success": config.after_success, "transform": lw.QAFTransform(plans)}
-    replay = lw.LanguageWorldExperienceReplay(
-        out / "demonstrations", sampler=lw.TaskBalancedSampler(exact=True), **rows
-    )
+    rows["sampler"] = lw.TaskBalancedSampler(exact=True)
+    replay = lw.LanguageWorldExperienceReplay(out / "demonstrations", **rows)
     cloning = lw.BehavioralCloningConfig(config.training_steps, config.batch_size, seed=config.training_seed)
     lw.BehavioralCloningTrainer(actor, replay, cloning, checkpoint=out / "checkpoint.safetensors").train()
     print(f"3/4  evaluating {config.episodes_per_task} episodes per task on seeds unused in the demonstrations")

@@ -128,11 +128,11 @@ def _check_scripted(plans: Plans, skills: Mapping[str, ScriptedSkill], sources: 
     """Raise a ValueError that names the steps of a plan that have no scripted skill, each with the task's nearest."""
     for task, plan in plans.items():
         own = skills_for(plan.definition, skills)
-        faults = [
-            f"step {number} {step.skill!r} (nearest: {nearest_skill(step.skill, plan.definition, own)[0].text!r})"
-            for number, step in enumerate(plan.steps, 1)
-            if step.skill not in skills
-        ]
+        faults = []
+        for number, text in enumerate((step.skill for step in plan.steps), 1):
+            if text not in skills:
+                nearest = nearest_skill(text, plan.definition, own)[0].text
+                faults.append(f"step {number} {text!r} (nearest: {nearest!r})")
         if faults:
             name = task.replace("/", "__")
             paths = [Path(source, part) for source in reversed(sources) for part in (f"{name}.plan", "")]
@@ -189,23 +189,15 @@ class Evaluate:
             failures = [failure.to_json() for failure in result.failures or ()]
             output.show("failures", failures, f"\n{result.failure_table()}")
         if self.out is not None:
-            recorded = episodes_to_record(result)
             with locked(self.out, "out", folder=True, wait=True):
-                self._write(self.out, result, policy, use, evaluator, recorded)
+                recorded = self._write(self.out, result, policy, use, evaluator)
             names = ", ".join(f"{task} {episode}" for task, episode in recorded)
             kind = "failed" if result.mean_success < 1 else "successful"
             print(f"written to {self.out}; rollout.rrd shows the {kind} episodes {names}")
         return output
 
-    def _write(
-        self,
-        out: Path,
-        result: lw.EvaluationResult,
-        policy: Any,
-        use: Any,
-        evaluator: Any,
-        recorded: list[tuple[str, int]],
-    ) -> None:
+    def _write(self, out: Path, result: lw.EvaluationResult, policy: Any, use: Any, evaluator: Any) -> list[Any]:
+        """Write the files and return the recorded episodes, as pairs of task and index."""
         from lw_torchrl.record.rollouts import new_recording, run_recorded
         from lw_torchrl.training.checkpoint import policy_file
 
@@ -214,21 +206,22 @@ class Evaluate:
         for name, file in (("checkpoint", policy_file(self.policy)), ("evaluator", Path(rollout.evaluator or ""))):
             origin[name] = file if file.is_file() else None
         result.save(out / "results.json", **origin)
-        lw.evaluation.plot_success(
-            result, out / "success.png", title=f"{self.policy}, {self.episodes} episodes per task"
-        )
+        title = f"{self.policy}, {self.episodes} episodes per task"
+        lw.evaluation.plot_success(result, out / "success.png", title=title)
         if use is not None:
             write_json(out / "plan_use.json", {task: counts.to_json() for task, counts in use.tasks().items()})
         if rollout.attribute:
             lw.evaluation.plot_failures(result, out / "failures.png", title=self.policy)
         page: dict[str, Any] = {"seed": rollout.seed, "policy": options.policy_name(self.policy)}
         failures = {(failure.task, failure.episode): failure for failure in result.failures or ()}
+        recorded = episodes_to_record(result)
         with new_recording(out / "rollout.rrd") as logger:
             for task, number in recorded:
                 run: dict[str, Any] = {"episodes": [number], "evaluator": evaluator, **rollout.arguments}
                 (episode,) = run_recorded(policy, task, **run)
                 page |= {"suite": rollout.chosen_suite, "failure": failures.get((task, number))}
                 lw.log_rollout(logger, episode.steps, plans, **page)
+        return recorded
 
 
 def episodes_to_record(result: lw.EvaluationResult) -> list[tuple[str, int]]:
@@ -246,8 +239,7 @@ def episodes_to_record(result: lw.EvaluationResult) -> list[tuple[str, int]]:
 
 def _show_plan_use(output: Output, result: lw.EvaluationResult, use: lw.evaluation.PlanUse, plans: Plans) -> None:
     """Print the result and, for each plan step, how often its condition held, how often the policy chose the step, and
-    in how many failed episodes the policy got stuck in it.
-    """
+    in how many failed episodes the policy got stuck in it."""
     steps = {}
     for task, used in use.tasks().items():
         columns = zip(plans[task].steps, used.true, used.chosen, used.stuck, strict=True)

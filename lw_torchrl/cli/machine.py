@@ -90,6 +90,11 @@ def find_slow_parts() -> list[str]:
 
 
 def _machine() -> dict[str, str]:
+    images = "yes"
+    try:
+        Cameras().close()
+    except ImportError as error:
+        images = f"no: {error}"
     gpus = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
     build = f"PyTorch built with CUDA {torch.version.cuda}" if torch.version.cuda else "PyTorch built without CUDA"
     return {
@@ -97,16 +102,8 @@ def _machine() -> dict[str, str]:
         "cores": f"{available_cores()} of {os.cpu_count()}",
         "gpu": f"{', '.join(gpus) or 'none'} ({build})",
         "numba": f"{find_version('numba')} ({'in use' if find_kernel() else 'not in use'})",
-        "camera images": _camera_images(),
+        "camera images": images,
     }
-
-
-def _camera_images() -> str:
-    try:
-        Cameras().close()
-    except ImportError as error:
-        return f"no: {error}"
-    return "yes"
 
 
 def _cache_folders() -> dict[str, str]:
@@ -118,11 +115,9 @@ def _cache_folders() -> dict[str, str]:
         "Hugging Face": os.environ.get("HF_HOME") or user / "huggingface",
         "language models' answers": Path("runs/answers"),
     }
-    return {name: _describe_folder(Path(path)) for name, path in folders.items()}
-
-
-def _describe_folder(path: Path) -> str:
-    there = "" if path.is_dir() else " (does not exist yet)"
-    locked = path.is_dir() and not os.access(path, os.W_OK)
-    shown = str(path).replace(str(Path.home()), "~", 1) if path.is_relative_to(Path.home()) else str(path)
-    return f"{shown}{there}{' (not writable)' if locked else ''}"
+    described = {}
+    for name, path in ((name, Path(path)) for name, path in folders.items()):
+        shown = str(path).replace(str(Path.home()), "~", 1) if path.is_relative_to(Path.home()) else str(path)
+        unusable = " (not writable)" if path.is_dir() else " (does not exist yet)"
+        described[name] = shown + ("" if os.access(path, os.W_OK) else unusable)
+    return described

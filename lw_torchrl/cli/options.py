@@ -38,16 +38,6 @@ class Output:
 
     Attributes:
         fault: an error found in the user's files; :meth:`finish` raises it after all other output.
-
-    Example:
-        >>> columns = {"task": "task", "episodes": "run"}
-        >>> _ = Output(as_json=False).table("tasks", [{"task": "push", "run": 3}], columns)
-        task  episodes
-        push  3
-        >>> Output(as_json=True).show("rate", float("nan"), "unknown").finish()
-        {
-          "rate": null
-        }
     """
 
     def __init__(self, as_json: bool) -> None:
@@ -206,8 +196,7 @@ def read_encoder(name: str | None) -> TextEncoder | None:
 
 def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> lw.QueryEvaluator:
     """Return an evaluator for ``plans``: loaded from a file, imported from "my_module:evaluator", or newly
-    created from a registered class.
-    """
+    created from a registered class."""
     encoder = read_encoder(text_encoder)
     if Path(name).exists() or not (":" in name or name == "StateQueryEvaluator"):
         return lw.training.load_evaluator(name, plans, text_encoder=encoder)
@@ -215,9 +204,7 @@ def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> 
     if isinstance(evaluator, lw.QueryEvaluator):
         return evaluator.with_plans(plans)
     if not (isinstance(evaluator, type) and issubclass(evaluator, lw.QueryEvaluator)):
-        raise ValueError(
-            f"--evaluator {name} must be an instance or a subclass of lw.QueryEvaluator, got {evaluator!r:.80}"
-        )
+        raise ValueError(f"--evaluator {name} must be a lw.QueryEvaluator or a subclass, got {evaluator!r:.80}")
     return evaluator(plans)
 
 

@@ -231,8 +231,7 @@ class Read:
 
     def _plans(self, source: str) -> list[tuple[lw.ConditionalPlan, DecodedPlan | None]]:
         """Return the plans in a source; with --task, only that task's plan. A plan decoded from a language model's
-        answer comes with the :class:`DecodedPlan`, any other plan with None.
-        """
+        answer comes with the :class:`DecodedPlan`, any other plan with None."""
         file = Path(source)
         if file.is_file() and (options.is_answer(file) or (self.scripted and file.suffix == ".plan")):
             return self._decoded(file)

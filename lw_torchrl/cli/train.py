@@ -13,7 +13,6 @@ from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
 from lw_torchrl._util.checks import Count, Natural, Probability, Scale, counted
-from lw_torchrl._util.files import companion
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Maybe, Output, read_evaluator
 
@@ -48,8 +47,7 @@ class Train:
     method: Annotated[str, arg(help=_METHOD)] = "pcbc"
     features: Maybe[Literal["raw", "differences", "relative", "both"]] = None
     """features of the state: raw (the observation), differences (between hand, objects and goal; the default), both, or
-    relative (as differences, but without the hand's height and the gripper opening)
-    """
+    relative (as differences, but without the hand's height and the gripper opening)"""
     width: Maybe[Count] = None  # units of each hidden layer (default: 256)
     depth: Maybe[Natural] = None  # number of hidden layers (default: 3)
     after_success: Natural = 20  # with --loss bc, drop rows more than N time steps after the first success
@@ -145,7 +143,7 @@ class Train:
         data = n_step_data = replay(n_steps=N_STEPS, gamma=GAMMA)
         device = place(actor, self.device)
         if self.loss == "advantage":
-            file = companion(self.out, ".value.safetensors", stem=self.out.stem)
+            file = self.out.with_name(f"{self.out.stem}.value.safetensors")
             value: dict[str, Any] = {"checkpoint": file, "title": "training the value"}
             advantage = learn_advantages(plans, n_step_data, config, device, **value)
             data = replay()
@@ -341,8 +339,6 @@ class TrainEvaluator:
         for root in roots:
             dataset = read_metadata(root).config
             if not (shared := [task for task in tasks if task in dataset.tasks]):
-                raise ValueError(
-                    f"--data {root} has none of the selected tasks; the dataset has {', '.join(dataset.tasks)}"
-                )
+                raise ValueError(f"--data {root} has none of the selected tasks, only {', '.join(dataset.tasks)}")
             chosen.append(dict.fromkeys(shared, dataset.episodes_per_task))
         return lw.LanguageWorldExperienceReplay(list(roots), label="executed", episodes=chosen)

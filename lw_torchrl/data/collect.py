@@ -24,11 +24,11 @@ from torch import nn
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lw_torchrl._util.checks import Count, Scale, differences, typed
+from lw_torchrl._util.checks import Count, Scale, typed
 from lw_torchrl._util.devices import CPU, device_of
 from lw_torchrl._util.files import AnyPath, check_damage, flush, locked, read_json, replacing, write_json
 from lw_torchrl._util.progress import Progress
-from lw_torchrl._util.reproducibility import SIMULATORS, package_versions, version_changes
+from lw_torchrl._util.reproducibility import SIMULATORS, differences, package_versions, version_changes
 from lw_torchrl._util.workers import Episodes, spread
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour, SegmentActor, behaviour_of, segment_plans

@@ -63,15 +63,14 @@ def check_image(name: str, image: Any) -> NDArray[np.uint8]:
     """Convert an image of shape H×W, H×W×C or C×H×W (C = 1 or 3), uint8 or float in [0, 1], to H×W×C uint8."""
     pixels = torch.as_tensor(image).detach().cpu()
     shape = tuple(pixels.shape)
-    if pixels.ndim == 2:
-        pixels = pixels[..., None]
-    elif pixels.ndim == 3 and shape[-1] not in (1, 3) and shape[0] in (1, 3):
-        pixels = pixels.permute(1, 2, 0)
+    pixels = pixels[..., None] if len(shape) == 2 else pixels
+    if len(shape) == 3 and shape[-1] not in (1, 3):
+        pixels = pixels.movedim(0, -1)
     if pixels.is_floating_point() and bool(((pixels >= 0) & (pixels <= 1)).all()):
         pixels = (pixels * 255).round().to(torch.uint8)
     if pixels.ndim != 3 or pixels.shape[-1] not in (1, 3) or not pixels.numel() or pixels.dtype != torch.uint8:
-        allowed = "uint8 or float in [0, 1], with shape H×W, H×W×C or C×H×W (C = 1 or 3)"
-        raise ValueError(f"image {name!r} must be {allowed}, got {pixels.dtype} with shape {shape}")
+        allowed = "uint8 or float in [0, 1] of shape H×W, H×W×C or C×H×W (C = 1 or 3)"
+        raise ValueError(f"image {name!r} must be {allowed}, got {pixels.dtype} of shape {shape}")
     return pixels.contiguous().numpy()
 
 

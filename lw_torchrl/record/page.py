@@ -40,13 +40,12 @@ WRONG: Color = (200, 60, 140)
 TOUCHES_CLOSED, TOUCHES_OPEN = (225, 130, 60), (150, 165, 220)
 LONGEST_LANE = 130  # maximum number of characters of a lane's title
 MANY_LANES = 9  # with more timeline lanes, a small window has little room for the verdict
-CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
+CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {  # name -> title, and value range (None: not fixed)
     "distance": ("Distance to the target, cm", None),
     "action": ("Action", (-1.2, 1.2)),
     "reward": ("Reward", None),
     "skill_weights": ("Skill weights", (-0.1, 1.1)),
 }
-"""A mapping from curves to their titles and value ranges (None: no fixed range)."""
 
 
 @dataclass
@@ -80,12 +79,7 @@ class Lanes:
 
 
 def log_lanes(
-    stream: Any,
-    root: str,
-    episode: RecordedEpisode,
-    ended: str,
-    touched: Sequence[str] | None,
-    ghost: Ghost | None,
+    stream: Any, root: str, episode: RecordedEpisode, ended: str, touched: Sequence[str] | None, ghost: Ghost | None
 ) -> Lanes:
     """Log the timeline lanes of an episode below ``root``; ``ended`` is the verdict, and ``touched`` holds the object
     that the fingers touch in each row."""

@@ -131,8 +131,7 @@ class RecordedEpisode:
 
     def with_target_poses(self, task: Task, suite: Suite | None) -> RecordedEpisode:
         """Return a copy of the episode that also holds the target poses of the plan's scripted skills for the task
-        ``task``.
-        """
+        ``task``."""
         skills = load_skills() if suite is None or suite.skills is None else suite.skills
         assert self.observation is not None
         positions = task.positions(torch.from_numpy(self.observation))
@@ -229,8 +228,7 @@ class Ghost:
 
 def _reason(step: Any) -> str:
     """Return the comment on a plan step, or, for a canonical plan, the original text of the step."""
-    role = getattr(step, "role", None)
-    if role is None:
+    if (role := getattr(step, "role", None)) is None:
         return str(getattr(step, "reason", ""))
     written = f"as written: {role.written}" if role.written and role.written != step.skill else ""
     return "fallback" if role.fallback else written

@@ -26,14 +26,7 @@ from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.text import markdown
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plans import ConditionalPlan
-from lw_torchrl.record.entities import (
-    METRIC_TIMELINE,
-    STEP_TIME,
-    entity_path,
-    rr,
-    send_images,
-    time_columns,
-)
+from lw_torchrl.record.entities import METRIC_TIMELINE, STEP_TIME, entity_path, rr, send_images, time_columns
 from lw_torchrl.record.meshes import LoggedMeshes, Motion
 from lw_torchrl.record.page import send_page
 from lw_torchrl.record.recorded_episode import Ghost, PlanLike, RecordedEpisode
@@ -200,15 +193,12 @@ class RerunLogger(Logger):
         counts, edges = np.histogram(values, bins=kwargs.get("bins", 30))
         bars = {"abscissa": [(edges[1:] + edges[:-1]) / 2], "widths": [np.diff(edges)], "color": [BAR_COLOR]}
         chart = rr.BarChart.columns(values=[counts.astype(np.int64)], **bars)
+        stream, path = self._open(), entity_path("histograms", *_name_parts(name))
         with self._lock:
-            self._open().send_columns(*self._place("histograms", name, kwargs.get("step")), chart)
+            self._tabs.add_view("histograms", name)
+            step = rr.TimeColumn(METRIC_TIMELINE, sequence=[self._count(path, kwargs.get("step"))])
+            stream.send_columns(path, [step], chart)
             self._send()
-
-    def _place(self, kind: str, name: str, step: int | None) -> tuple[str, list[Any]]:
-        """Add a view for a value logged at a training step; return the value's entity path and time columns."""
-        path = entity_path(kind, *_name_parts(name))
-        self._tabs.add_view(kind, name)
-        return path, [rr.TimeColumn(METRIC_TIMELINE, sequence=[self._count(path, step)])]
 
     def flush(self, timeout: float | None = None) -> None:
         """Send all data to the file and the viewer, and wait at most ``timeout`` seconds (default: 5) for delivery."""
@@ -366,11 +356,12 @@ def _new_file(path: Path) -> Path:
     """Create the file ``path``, or if it exists, "run-2.rrd", "run-3.rrd", etc. (the first unused name), and return the
     path of the new file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    for free in chain([path], (path.with_stem(f"{path.stem}-{i}") for i in count(2))):
+    free, number = path, 1
+    while True:
         with suppress(FileExistsError):
             free.touch(exist_ok=False)
             return free
-    raise AssertionError("unreachable")
+        free, number = path.with_stem(f"{path.stem}-{number + 1}"), number + 1
 
 
 def _name_parts(name: str) -> list[str]:

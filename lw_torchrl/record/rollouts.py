@@ -271,26 +271,10 @@ def run_recorded(
             steps = answer(steps)
         finished[episode.task, episode.episode] = episode._replace(steps=steps)
 
-    run_rollout(
-        "recording",
-        actor,
-        chosen,
-        dict.fromkeys(chosen, episodes),
-        keep,
-        plans=own_plans,
-        evaluator=evaluator,
-        env_options=options,
-        keys=_KEYS,
-        optional=[
-            *(_PLAN_KEYS if own_plans is not None else ()),
-            *(learned[0].in_keys if learned else ()),
-            "pixels",
-        ],
-        noise_scale=noise_scale,
-        after_success=0 if stop_at_success else None,
-        device=device,
-        progress=progress,
-    )
+    optional = [*(_PLAN_KEYS if own_plans is not None else ()), *(learned[0].in_keys if learned else ()), "pixels"]
+    run: dict[str, Any] = {"noise_scale": noise_scale, "after_success": 0 if stop_at_success else None}
+    run |= {"plans": own_plans, "evaluator": evaluator, "env_options": options, "device": device, "progress": progress}
+    run_rollout("recording", actor, chosen, dict.fromkeys(chosen, episodes), keep, keys=_KEYS, optional=optional, **run)
     return [finished[task, episode] for task in chosen for episode in episodes]
 
 

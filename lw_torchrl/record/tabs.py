@@ -17,9 +17,7 @@ from lw_torchrl.record.page import Page
 OVERVIEW = "overview"
 """The name of the overview tab and of the overview's entity."""
 TITLES = {kind: kind.title() for kind in ("metrics", "histograms", "videos")} | {"hparams": "Hyperparameters"}
-"""Titles of the tabs without episodes, by key. The keys are the first part of entity paths, so no episode may have such
-a name.
-"""
+"""Titles of the tabs without episodes, by the first part of the entity paths, which cannot be an episode's name."""
 ON_METRIC_TIMELINE = {"metrics", "histograms"}
 _PROPERTY = "layout"
 
@@ -54,8 +52,7 @@ class Tabs:
 
     def add(self, kind: str, content: Any) -> None:
         """Add content of one ``kind``: an episode's "page", a "compare" tab (a title and the names of the episodes to
-        compare), or a "view" of logged values.
-        """
+        compare), or a "view" of logged values."""
         self._entries.append(json.dumps([kind, content]))
         if kind == "page":
             self.pages[content["row"]["name"]] = Page(**content)
@@ -119,23 +116,19 @@ class Tabs:
         # Titles include the policy unless several episodes all have the same policy.
         name_policies = len({page.row["policy"] for page in pages}) > 1 or len(pages) == 1
         titles = {page.row["name"]: page.title(policy=name_policies) for page in pages}
-        compared = [
-            Tab(title, title, partial(self._comparison, title, names, titles), names) for title, names in self._compared
-        ]
+        views = [(title, names, partial(self._comparison, title, names, titles)) for title, names in self._compared]
+        compared = [Tab(title, title, view, names) for title, names, view in views]
         of_episodes = [Tab(name, title, partial(self.pages[name].tab, title), [name]) for name, title in titles.items()]
-        of_training = [
-            Tab(TITLES[kind], TITLES[kind], partial(_values_view, kind, names), [],
-                METRIC_TIMELINE if kind in ON_METRIC_TIMELINE else EPISODE_TIMELINE)
-            for kind, names in self._views.items()
-            if names
-        ]  # fmt: skip
+        of_training = []
+        for kind, names in self._views.items():
+            timeline = METRIC_TIMELINE if kind in ON_METRIC_TIMELINE else EPISODE_TIMELINE
+            if names:
+                of_training.append(Tab(TITLES[kind], TITLES[kind], partial(_values_view, kind, names), [], timeline))
         if not has_overview:
             return compared + of_episodes + of_training
-        first = Tab(OVERVIEW, OVERVIEW.title(), self._overview_view, [pages[0].row["name"]])
-        return [first, *compared, *of_training, *of_episodes]
-
-    def _overview_view(self) -> Any:
-        return rrb.TextDocumentView(origin=entity_path(OVERVIEW, "table"), name=OVERVIEW.title())
+        title = OVERVIEW.title()
+        view = partial(rrb.TextDocumentView, origin=entity_path(OVERVIEW, "table"), name=title)
+        return [Tab(OVERVIEW, title, view, [pages[0].row["name"]]), *compared, *of_training, *of_episodes]
 
     def _comparison(self, title: str, names: list[str], titles: dict[str, str]) -> Any:
         """Return a view with a column for each episode; all columns have the same axes."""
@@ -195,9 +188,7 @@ def _order(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def overview(rows: Iterable[dict[str, Any]]) -> str:
-    """Return a Markdown text with the counts of failures and causes, and a table with one row per episode, failures
-    first.
-    """
+    """Return the counts of failures and causes, and a table with one row per episode, failures first, as Markdown."""
     rows = sorted(rows, key=_order)
     ended = Counter(row["ended"] for row in rows)
     causes = Counter(row["cause"] for row in rows if row["cause"])

@@ -128,9 +128,8 @@ def verdict(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None = No
     if ghost is not None:
         end, parting = ghost.episode.first_success, ghost.parts_at(episode)
         ended = "does not succeed" if end is None else f"succeeds at {episode.at(end)}"
-        lines.insert(
-            1, f"**The blue ghost**, with {markdown(ghost.by)}, {ended}; the two diverge at **t = {parting}**."
-        )
+        text = f"**The blue ghost**, with {markdown(ghost.by)}, {ended}; the two diverge at **t = {parting}**."
+        lines.insert(1, text)
     # Use single line breaks, because paragraphs would not fit into a small window.
     head = f"**{lines[0]}**  \n" if small else f"#### {lines[0]}\n\n"
     return head + "  \n".join([*lines[1:], " · ".join(map(markdown, heading.parts()))]) + "\n"
@@ -163,18 +162,13 @@ def _observations(episode: RecordedEpisode) -> list[str]:
         pose = episode.target_poses[last] if episode.target_poses else None
         if pose is not None and not pose.relative:
             distance = np.where(episode.active == last, pose.distance, np.inf)
-            nearest = int(distance.argmin())
-            lines.append(
-                f"The smallest distance to the target was **{distance[nearest] * 100:.1f} cm**, at "
-                f"{episode.at(nearest)}; the distance at the end was {pose.distance[-1] * 100:.1f} cm."
-            )
+            closest, end = (f"{number * 100:.1f} cm" for number in (distance.min(), pose.distance[-1]))
+            when = episode.at(int(distance.argmin()))
+            lines.append(f"The smallest distance to the target was **{closest}**, at {when}; at the end it was {end}.")
     answers = episode.answers
     never = [] if answers is None else [i for i in range(len(episode.steps)) if not answers[:, i].any()]
-    if never:
-        lines.append(
-            "Never true: " + "; ".join(f"condition {i + 1}, “{markdown(episode.steps[i][0])}”" for i in never) + "."
-        )
-    return lines
+    texts = [f"condition {i + 1}, “{markdown(episode.steps[i][0])}”" for i in never]
+    return lines + ([f"Never true: {'; '.join(texts)}."] if texts else [])
 
 
 def _step(episode: RecordedEpisode, step: int) -> str:
@@ -210,25 +204,21 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
         texts.append("  \n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
     stream.send_columns(f"{root}/plan", episode.times(rows), documents)
-    full = "  \n".join(
-        f"{i}.  if {markdown(condition)}  \n{INDENT}{markdown(skill)}"
-        for i, (condition, skill) in enumerate(episode.steps, 1)
-    )
-    stream.log(f"{root}/conditions", rr.TextDocument(full, media_type=rr.MediaType.MARKDOWN), static=True)
+    texts = [f"{i}.  if {markdown(c)}  \n{INDENT}{markdown(skill)}" for i, (c, skill) in enumerate(episode.steps, 1)]
+    full = rr.TextDocument("  \n".join(texts), media_type=rr.MediaType.MARKDOWN)
+    stream.log(f"{root}/conditions", full, static=True)
     reasons = [max(episode.reasons, key=len, default="")]
     return sum(-(-len(text) // LINE) for text in [INDENT * line.depth + text for line, text in lines] + reasons)
 
 
 def _plan_lines(episode: RecordedEpisode) -> list[tuple[Line, str]]:
     """Return the lines of the plan's outline, each with its text; long conditions are shortened."""
-    skills = [f"{i}.  {markdown(skill)}" for i, (_, skill) in enumerate(episode.steps, 1)]
-    return [
-        (
-            line,
-            markdown(shorten(str(line), MOST_LINES * LINE, placeholder=" …")) if line.head else skills[line.steps[0]],
-        )
-        for line in outline(episode.guards)
-    ]
+    lines = []
+    for line in outline(episode.guards):
+        step = line.steps[0]
+        text = shorten(str(line), MOST_LINES * LINE, placeholder=" …") if line.head else episode.steps[step][1]
+        lines.append((line, ("" if line.head else f"{step + 1}.  ") + markdown(text)))
+    return lines
 
 
 def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
@@ -266,7 +256,7 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
 
 def action_names(layout: Layout) -> list[str]:
     """Return a name for each of the A values of an action: "dx", "dy", "dz", "gripper", or the index."""
-    names = [str(number) for number in range(layout.action_size)]
+    names = [*map(str, range(layout.action_size))]
     if layout.displacement is not None:
         names[layout.displacement : layout.displacement + 3] = "dx", "dy", "dz"
     if layout.gripper is not None:

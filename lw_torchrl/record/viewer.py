@@ -18,8 +18,7 @@ from typing import IO, Any, NamedTuple
 from urllib.parse import quote
 
 from lw_torchrl._util.checks import Natural, typed
-from lw_torchrl._util.files import AnyPath, replacing
-from lw_torchrl._util.limits import run_limited
+from lw_torchrl._util.files import AnyPath, replacing, run_limited
 from lw_torchrl.record.entities import EPISODE_TIMELINE
 from lw_torchrl.record.own_host import LOCAL, START_SECONDS, forwarded, hidden_address
 from lw_torchrl.record.rerun_logger import is_complete
@@ -140,14 +139,9 @@ def open_viewer(
 
 def find_recordings(path: AnyPath) -> list[Path]:
     """Return ``path`` itself if it is a file, or all recordings in the folder ``path``, oldest first."""
-    recording = Path(path)
-    if not recording.is_dir():
-        if not recording.is_file():
-            raise FileNotFoundError(f"no recording {str(recording)!r}; pass a .rrd file or a folder of .rrd files")
-        return [recording]
-    recordings = [file for file in recording.glob("*.rrd") if not file.name.startswith(".")]
+    recordings = [Path(path)] if Path(path).is_file() else [*Path(path).glob("[!.]*.rrd")]
     if not recordings:
-        raise FileNotFoundError(f"folder {str(recording)!r} holds no recording (*.rrd)")
+        raise FileNotFoundError(f"no recording {str(path)!r}; pass a .rrd file or a folder of .rrd files")
     return sorted(recordings, key=lambda file: (file.stat().st_mtime, file.name))
 
 
@@ -166,13 +160,11 @@ def damaged(recording: Path) -> Iterator[None]:
 def readable(recording: Path) -> Iterator[Path]:
     """Yield the path of a recording, or of a repaired copy if the recording was not closed properly; otherwise Rerun
     would wait for the rest of the incomplete file. A child process reads the file first, because Rerun trusts the sizes
-    that a file declares.
-    """
+    that a file declares."""
     with tempfile.TemporaryDirectory() as folder:
         file = recording
         if not is_complete(recording):
-            message = f"recording {str(recording)!r} was not closed; it is shown as far as it was written"
-            warnings.warn(message, stacklevel=4)
+            warnings.warn(f"recording {str(recording)!r} was not closed; its readable part is shown", stacklevel=4)
             file = Path(folder) / recording.name
             _check(recording, rerun_program(), "rrd", "merge", recording, "-o", file)
         _check(recording, sys.executable, "-P", "-c", _READ, file)
@@ -195,7 +187,7 @@ def _check(recording: Path, *command: str | Path) -> None:
         done = run_limited(command, recording.stat().st_size)
     if done.returncode:
         reason = done.stderr.decode("utf-8", "replace").strip().splitlines()[-1:]
-        raise ValueError(f"{str(recording)!r} is not a Rerun recording, or is damaged ({''.join(reason)})")
+        raise ValueError(f"recording {str(recording)!r} is damaged ({''.join(reason)})")
 
 
 class Opening(NamedTuple):
@@ -233,8 +225,7 @@ def _connect(process: subprocess.Popen[bytes], port: str, recordings: int) -> An
 
 def _go_to(client: Any, openings: dict[str, Opening]) -> None:
     """Select tabs, set time cursors, and show the last recording. By default, a cursor is set to its timeline's last
-    step.
-    """
+    step."""
     recordings = {recording.store_id.rpartition(":")[2]: recording for recording in client.get_state().recordings}
     for recording_id, (tab, name, step) in openings.items():
         recording = recordings[recording_id]

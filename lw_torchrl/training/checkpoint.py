@@ -13,9 +13,9 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import differences, shown, typed
-from lw_torchrl._util.files import AnyPath, absent_policy, companion, expanded, locked, shipped_policy
-from lw_torchrl._util.reproducibility import LIBRARIES, warn_of_other_versions
+from lw_torchrl._util.checks import shown, typed
+from lw_torchrl._util.files import AnyPath, absent_policy, expanded, locked, shipped_policy
+from lw_torchrl._util.reproducibility import LIBRARIES, differences, warn_of_other_versions
 from lw_torchrl._util.tensor_files import AllocationLimit, pop_state, read_tensors, write_tensors
 from lw_torchrl.language.plans import AnyPlans, PlanError, as_plans
 from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
@@ -238,7 +238,7 @@ def demonstrated_tasks(path: AnyPath) -> set[str]:
 
 def training_file(checkpoint: Path) -> Path:
     """Return the path of the training state stored next to a policy, for example ``mt10.training.safetensors``."""
-    return companion(checkpoint, f".training{checkpoint.suffix}", stem=checkpoint.stem)
+    return checkpoint.with_name(f"{checkpoint.stem}.training{checkpoint.suffix}")
 
 
 def check_description(path: Path, expected: Mapping[str, Any], stored: Mapping[str, Any] | None = None) -> None:

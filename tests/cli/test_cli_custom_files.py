@@ -44,9 +44,8 @@ def own(tmp_path_factory):
     (folder / "reach.plan").write_text(PLAN)
     (folder / "skills.toml").write_text(SKILLS)
     (folder / "my_texts.py").write_text(ENCODER)
-    lw.collect_demonstrations(
-        ["push", "reach"], episodes_per_task=1, root=folder / "demos", max_steps=30, progress=False
-    )
+    short = {"episodes_per_task": 1, "max_steps": 30, "progress": False}
+    lw.collect_demonstrations(["push", "reach"], root=folder / "demos", **short)
     return folder
 
 
@@ -61,9 +60,8 @@ def test_scripted_skills_carry_out_a_custom_plan(capsys, tmp_path):
     assert "reach: success 1.00" in printed
     assert "go to the ball" in printed
     assert len(json.loads((tmp_path / "out" / "results.json").read_text())["origin"]["plans"]) == 32
-    assert "yes: the robot's gripper is not near the ball" in run(
-        capsys, "query", "reach", "the gripper is not near the ball", "--task-file", "tasks.toml"
-    )
+    query = ("query", "reach", "the gripper is not near the ball", "--task-file", "tasks.toml")
+    assert "yes: the robot's gripper is not near the ball" in run(capsys, *query)
 
 
 def test_a_policy_is_trained_with_custom_files(capsys, tmp_path):

@@ -4,7 +4,9 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import pytest
 from commands import fails, run
@@ -57,33 +59,13 @@ print([name for name in ("torch", "torchrl", "mujoco", "rich") if name in sys.mo
     assert python(program).stdout.splitlines()[-1] == "[]"
 
 
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        (["evalute"], "did you mean 'evaluate'?"),
-        (["data", "shwo"], "did you mean 'data show'?"),
-        (["--seed", "1", "train"], "'--seed'"),
-        (["tasks", "raech"], "did you mean 'reach'"),
-        (["tasks", "--import", "no_such_module"], "No module named 'no_such_module'"),
-        (["evaluate", "nowhere.safetensors"], "no file 'nowhere.safetensors'"),
-        (["collect", "reach", "--out", "OUT", "--episodes", "0"], "--episodes must be an integer of at least 1, got 0"),
-        (
-            ["collect", "reach", "--out", "OUT", "--noise", "0", "-0.1"],
-            "--noise must be tuple[finite number of at least",
-        ),
-        (["evaluate", "random", "--max-steps", "0"], "--max-steps must be an integer of at least 1 or None, got 0"),
-        (
-            ["train-evaluator", "reach", "--out", "OUT", "--held-out-pairs", "2"],
-            "--held-out-pairs must be a number from",
-        ),
-        (["train", "nowhere", "--out", "OUT"], "nowhere"),
-        (["view", "nowhere.rrd"], "nowhere.rrd"),
-        (["check", "nowhere.plan"], "no such file, folder or suite: 'nowhere.plan'"),
-    ],
-)
-def test_an_error_is_one_line_and_status_2(capsys, tmp_path, monkeypatch, args, message):
+ERRORS = tomllib.loads((Path(__file__).parent / "errors.toml").read_text("utf-8"))["cases"]
+
+
+@pytest.mark.parametrize(("command", "message"), ERRORS)
+def test_an_error_is_one_line_and_status_2(capsys, tmp_path, monkeypatch, command, message):
     monkeypatch.chdir(tmp_path)
-    error = fails(capsys, *args)
+    error = fails(capsys, *command.split())
     assert message in error
     assert error.count("\n") == 1
 

@@ -10,9 +10,8 @@ import lw_torchrl as lw
 
 
 def test_prompt_equals_that_of_plan_prompt(capsys):
-    assert run(capsys, "plan", "prompt", "drawer-open", "--format", "chain_py") == lw.planners.plan_prompt(
-        "drawer-open", "chain_py"
-    )
+    printed = run(capsys, "plan", "prompt", "drawer-open", "--format", "chain_py")
+    assert printed == lw.planners.plan_prompt("drawer-open", "chain_py")
     printed = run(capsys, "plan", "prompt", "push", "--format", "goal_md", "--vocabulary", "--plans", "MT50")
     assert printed == lw.planners.plan_prompt("push", "goal_md", vocabulary=True, plans=lw.load_plans("MT50"))
 
@@ -30,10 +29,7 @@ def test_a_plan_in_own_words_can_be_scripted(capsys, tmp_path):
     assert near in run(capsys, *evaluate, tmp_path / "scripts")
 
 
-def test_read_prints_the_tree_of_a_program(capsys, tmp_path):
-    file = tmp_path / "push.py"
-    file.write_text(
-        """def push(robot):
+PROGRAM = """def push(robot):
     attempts += 1
     if check("the gripper is near the puck"):
         if check("the gripper is closed"):
@@ -45,18 +41,21 @@ def test_read_prints_the_tree_of_a_program(capsys, tmp_path):
     else:
         robot.move("above the puck")
 """
-    )
+TREE = """if gripper near puck
+  if gripper closed
+    push the puck to the target location
+  else
+    close the gripper
+else
+  move above the puck"""
+
+
+def test_read_prints_the_tree_of_a_program(capsys, tmp_path):
+    file = tmp_path / "push.py"
+    file.write_text(PROGRAM)
     printed = run(capsys, "plan", "read", file)
     tree = [re.split(r"(?<=\S) {2,}", line.rstrip())[0] for line in printed.splitlines()]
-    assert tree[2:9] == [
-        "if gripper near puck",
-        "  if gripper closed",
-        "    push the puck to the target location",
-        "  else",
-        "    close the gripper",
-        "else",
-        "  move above the puck",
-    ]
+    assert tree[2:9] == TREE.splitlines()
     assert "left out: 'dance wildly': no query is near enough" in printed
     assert "line 2: 'attempts += 1' is left out" in printed
     assert "\x1b" not in printed
@@ -78,9 +77,8 @@ def fetch__push(robot):
     file.write_text(plan)
     assert "mine.plan: 1 step, valid" in run(capsys, "check", file)
     assert "fetch/push" in run(capsys, "plan", "read", file)
-    assert {plan["task"] for plan in document(capsys, "plan read", "fetch")["plans"]} == {
-        *lw.suites.SUITES["fetch"].tasks
-    }
+    read = {plan["task"] for plan in document(capsys, "plan read", "fetch")["plans"]}
+    assert read == {*lw.suites.SUITES["fetch"].tasks}
 
 
 @pytest.mark.parametrize("format", lw.PLAN_FORMATS)
@@ -101,7 +99,7 @@ def test_read_parses_answers_of_language_models(capsys, tmp_path, format):
     assert "no plan can be read" in fails(capsys, "plan", "read", answer.with_name("push-0.txt"))
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def _no_key(monkeypatch):
     for name in ("OPENAI_API_KEY", "OPENAI_BASE_URL"):
         monkeypatch.delenv(name, raising=False)
@@ -119,7 +117,6 @@ def table(printed):
     return {tuple(row[:2]): row[2:] for row in cells if row[:1] in (["push"], ["reach"])}
 
 
-@pytest.mark.usefixtures("_no_key")
 def test_generate_writes_answers_and_counts_valid_plans(capsys, tmp_path):
     server = FakeServer(
         lambda body: completion("I will not", "length") if asked_for(body) == "reach" else shipped(body)
@@ -145,7 +142,6 @@ def test_generate_writes_answers_and_counts_valid_plans(capsys, tmp_path):
     assert "220 tokens" in constrained
 
 
-@pytest.mark.usefixtures("_no_key")
 def test_errors_of_generate_are_one_line(capsys, tmp_path):
     with serving(FakeServer(lambda body: error(404, "no such model"))) as address:
         assert "a/model" in fails(capsys, *generate(address, tmp_path, "push"))
@@ -154,7 +150,6 @@ def test_errors_of_generate_are_one_line(capsys, tmp_path):
     assert "OPENAI_API_KEY" in fails(capsys, "plan", "generate", "push", "--model", "m", "--cache", tmp_path / "kept")
 
 
-@pytest.mark.usefixtures("_no_key")
 def test_repair_asks_again_and_shows_the_success_of_each_round(capsys, tmp_path):
     def learns(body):
         is_repair = any(message["role"] == "assistant" for message in body["messages"])
@@ -171,7 +166,6 @@ def test_repair_asks_again_and_shows_the_success_of_each_round(capsys, tmp_path)
     assert (tmp_path / "plans/m-round1/chain_py/reach-0.py").is_file()
 
 
-@pytest.mark.usefixtures("_no_key")
 def test_repair_reuses_the_answers_of_generate(capsys, tmp_path):
     server = FakeServer(lambda body: completion(f"I cannot, for the {len(server.requests)}th time."))
     where = ("--out", tmp_path / "plans", "--cache", tmp_path / "kept", "--model", "m")

@@ -31,6 +31,10 @@ def policy(demos, tmp_path_factory):
     return path
 
 
+def files_in(folder):
+    return {path.name for path in folder.iterdir() if path.name[0] != "."}
+
+
 def test_train_writes_a_policy_and_resumes(capsys, demos, policy):
     actor = lw.load_actor(policy)
     assert isinstance(actor, lw.PlanConditionedActor)
@@ -74,8 +78,7 @@ def test_evaluate_writes_result_figure_and_recording(capsys, policy, tmp_path):
     out = tmp_path / "runs"
     args = ("evaluate", policy, "--tasks", "push", "reach", "--episodes", 1, "--seed", 7, "--max-steps", 60)
     printed = run(capsys, *args, "--attribute", "--reference", "MT10", "--out", out)
-    names = {"results.json", "success.png", "failures.png", "rollout.rrd"}
-    assert {path.name for path in out.iterdir() if path.name[0] != "."} == names
+    assert files_in(out) == {"results.json", "success.png", "failures.png", "rollout.rrd"}
     result = lw.EvaluationResult.load(out / "results.json")
     assert (result.config["seed"], result.config["episodes_per_task"], result.config["noise_scale"]) == (7, 1, 0.1)
     assert result.table() in printed
@@ -86,19 +89,15 @@ def test_evaluate_writes_result_figure_and_recording(capsys, policy, tmp_path):
     again = lw.evaluate(actor, tasks=["push", "reach"], episodes_per_task=1, seed=7, max_steps=60, progress=False)
     assert again.episodes == result.episodes
     assert f"written to {out}; rollout.rrd shows the failed episodes push 0, reach 0" in printed
-    assert [row["episode"] for row in document(capsys, "info", out / "rollout.rrd")["episodes"]] == [
-        "push-0",
-        "reach-0",
-    ]
+    recorded = document(capsys, "info", out / "rollout.rrd")["episodes"]
+    assert [row["episode"] for row in recorded] == ["push-0", "reach-0"]
 
 
 def test_evaluate_records_the_first_failures_of_the_worst_tasks():
     def recorded(**successes):
-        episodes = [
-            lw.evaluation.EpisodeResult(task, number, success, 1 if success else None, success, float(success))
-            for task, each in successes.items()
-            for number, success in enumerate(each)
-        ]
+        numbered = [(task, *each) for task, won in successes.items() for each in enumerate(won)]
+        make = lw.evaluation.EpisodeResult
+        episodes = [make(task, number, won, 1 if won else None, won, float(won)) for task, number, won in numbered]
         return episodes_to_record(lw.EvaluationResult({"tasks": [*successes]}, tuple(episodes)))
 
     outcomes = dict(a=[True, False], b=[True, True], c=[False, False], d=[True, False], e=[False, False])
@@ -134,24 +133,10 @@ def test_experts_and_scripted_plans_are_evaluated(capsys, tmp_path):
     assert document(capsys, "evaluate", "wrong", "--tasks", "push", *SHORT)["mean_success"] == 0.0
 
 
-def test_a_policy_in_python_is_evaluated(capsys, tmp_path, monkeypatch):
-    (tmp_path / "my_policies.py").write_text(
-        "import lw_torchrl as lw\npolicy = lw.ScriptedSkillActor(lw.load_plans('MT10'))\nnumber = 3\n"
-    )
-    monkeypatch.chdir(tmp_path)
-    options = ("--tasks", "reach", "--episodes", 1, "--stop-at-success")
-    assert document(capsys, "evaluate", "my_policies:policy", *options)["mean_success"] == 1.0
-    assert "my_policies:number" in fails(capsys, "evaluate", "my_policies:number")
-    assert "must have the form my_module:name" in fails(capsys, "evaluate", "my_policies:nothing")
-
-
-def test_info_describes_policies_datasets_and_recordings(capsys, demos, policy, tmp_path):
-    shipped = document(capsys, "info", "few-shot-mt50")
-    assert "below 0.8" in shipped["card"]
+def test_info_describes_policies_and_datasets(capsys, demos, policy):
+    assert "below 0.8" in document(capsys, "info", "few-shot-mt50")["card"]
     assert "tasks: push, reach" in run(capsys, "info", policy)
     assert "behaviour  noisy" in run(capsys, "info", demos)
-    run(capsys, "record", "reach", "--max-steps", 5, "--out", tmp_path / "a.rrd")
-    assert document(capsys, "info", tmp_path / "a.rrd")["episodes"] == [{"episode": "reach-0", "steps": 5}]
 
 
 # ---- demo
@@ -175,26 +160,25 @@ from lw_torchrl.cli import demo
 demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episodes_per_task={config.episodes_per_task})
 """
     demonstrations = out / "demonstrations"
-    demo = ("demo", "--quick", "--out", out)
-    forks.start(*demo, before=shorter)
+
+    def start():
+        forks.start("demo", "--quick", "--out", out, before=shorter)
+
+    def finish():
+        start()
+        status, printed, errors = forks.end()
+        assert status == 0, errors
+        return printed
+
+    start()
     kill_when(forks, lambda: len(list(demonstrations.glob(".partial/*.npz"))) >= 2)
     assert not (demonstrations / "metadata.json").exists()
-    forks.start(*demo, before=shorter)
+    start()
     kill_when(forks, (out / "checkpoint.safetensors").exists)
     assert not (out / "results.json").exists()
-
-    forks.start(*demo, before=shorter)
-    status, printed, errors = forks.end()
-    assert status == 0, errors
-    assert {path.name for path in out.iterdir() if path.name[0] != "."} == {
-        "config.json",
-        "demonstrations",
-        "checkpoint.safetensors",
-        "checkpoint.training.safetensors",
-        "results.json",
-        "success.png",
-        "rollout.rrd",
-    }
+    printed = finish()
+    policies = {"checkpoint.safetensors", "checkpoint.training.safetensors"}
+    assert files_in(out) == {"config.json", "demonstrations", "results.json", "success.png", "rollout.rrd"} | policies
     assert json.loads((out / "config.json").read_text()) == json.loads(json.dumps(vars(config)))
     result = lw.EvaluationResult.load(out / "results.json")
     assert result.config["tasks"] == list(config.tasks)
@@ -203,27 +187,18 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
     assert f"lw-torchrl view {out / 'rollout.rrd'}" in printed
 
     policy = (out / "checkpoint.safetensors").read_bytes()
-    kept = [
-        "results.json",
-        "config.json",
-        "demonstrations/metadata.json",
-        "demonstrations/data/action.memmap",
-    ]
+    kept = ["results.json", "config.json", "demonstrations/metadata.json", "demonstrations/data/action.memmap"]
     before = {name: (out / name).stat().st_mtime_ns for name in kept}
-    forks.start(*demo, before=shorter)
-    status, again, errors = forks.end()
-    assert status == 0, errors
+    assert finish() == printed
     assert {name: (out / name).stat().st_mtime_ns for name in kept} == before
     assert (out / "checkpoint.safetensors").read_bytes() == policy
-    assert again == printed
 
 
 def test_a_demo_of_another_configuration_is_not_overwritten(capsys, tmp_path):
     (tmp_path / "config.json").write_text(json.dumps({**vars(QUICK), "training_steps": 7}))
     before = (tmp_path / "config.json").read_bytes()
     assert "different configuration" in fails(capsys, "demo", "--quick", "--out", tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
-    assert (tmp_path / "config.json").read_bytes() == before
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"config.json": before}
 
 
 def test_two_processes_cannot_write_one_demo(capsys, tmp_path, holding):

@@ -24,8 +24,8 @@ def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
     assert f"lw-torchrl view {out}" in printed
     assert tabs(out) == ["overview", "reach-0", "reach-2"]
     ended = [int(step) for step in re.findall(r"success at step (\d+)", printed)]
-    chunks = [chunk for chunk in RrdReader(out).stream() if str(chunk.entity_path).endswith("/action")]
-    assert sorted(len(chunk) for chunk in chunks if not chunk.is_static) == sorted(ended), "episodes end at the success"
+    lengths = [row["steps"] for row in document(capsys, "info", out)["episodes"]]
+    assert lengths == ended, "episodes end at the success"
 
 
 @pytest.mark.parametrize("who", ["random", "wrong"])
@@ -38,9 +38,7 @@ def test_a_random_policy_is_reproducible(capsys, tmp_path, who):
 
 def test_two_policies_are_shown_side_by_side(capsys, tmp_path):
     policy, out = tmp_path / "mine.safetensors", tmp_path / "x.rrd"
-    lw.save_actor(
-        lw.PlanConditionedActor(lw.load_plans("MT10"), decoder=lw.modules.MLPDecoder(width=16, depth=1)), policy
-    )
+    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10")), policy)
     printed = run(capsys, "record", "reach", "--policy", policy, "--compare", "scripted", *SHORT, "--out", out)
     assert "reach, episode 0, mine: failed" in printed
     assert "reach, episode 0, scripted: success at step " in printed
@@ -84,4 +82,6 @@ def test_custom_policies_and_evaluators_are_recorded(capsys, tmp_path, monkeypat
             assert "reach, episode 0" in run(capsys, "record", "reach", *options)
     wrong = ("record", "reach", "--policy", "scripted", "--evaluator", "my_parts:number")
     assert "--evaluator my_parts:number" in fails(capsys, *wrong)
+    assert "my_parts:number" in fails(capsys, "evaluate", "my_parts:number")
+    assert "must have the form my_module:name" in fails(capsys, "evaluate", "my_parts:nothing")
     assert "requires a policy with plans" in fails(capsys, "record", "reach", "--evaluator", "my_parts:never")

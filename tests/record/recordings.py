@@ -1,5 +1,6 @@
 """Rollouts to record, and recordings read back."""
 
+import io
 import socket
 import uuid
 from contextlib import contextmanager
@@ -8,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
@@ -101,6 +103,10 @@ class Recording:
         times, _ = self.columns[entity, component][0]
         return "step" not in times
 
+    def images(self, entity):
+        blobs = [bytes(blob[0]) for blob in self.values(entity, "EncodedImage:blob")]
+        return [np.asarray(Image.open(io.BytesIO(blob))) for blob in blobs]
+
     def text(self, entity):
         return self.values(entity, "TextDocument:text")[0][0]
 
@@ -129,25 +135,14 @@ class Recording:
         """Return the names of the tabs that the recording lists."""
         return [tab.name for tab in Tabs.read(self.reader).tabs()]
 
-    def tabs(self):
-        """Return the names of the tabs, as many as rerun's layout has."""
-        names = self.saved_tabs()
-        assert len(names) == len(self.shown_tabs())
-        return names
-
     def shown_tabs(self):
         """Return the titles in rerun's own layout, and the titles of each tab's views."""
         values = self.blueprint()
         (root,) = values["viewport", "root_container"]
         contents = values.get((f"container/{uuid.UUID(bytes=bytes(root))}", "contents"), [])
-        titles = {}
-        for path in contents:
-            inside = values.get((path.strip("/"), "contents"), [])
-            titles[self._title(values, path)] = [self._title(values, child) for child in inside]
-        return titles
-
-    def _title(self, values, path):
-        return values.get((path.strip("/"), "display_name"), [""])[0]
+        title = lambda path: values.get((path.strip("/"), "display_name"), [""])[0]  # noqa: E731
+        inside = lambda path: values.get((path.strip("/"), "contents"), [])  # noqa: E731
+        return {title(path): [title(child) for child in inside(path)] for path in contents}
 
     def blueprint(self):
         """Return the values of rerun's layout, by entity and field."""

@@ -47,21 +47,24 @@ def test_a_rollout_may_have_only_pictures_and_rewards(tmp_path):
     assert not Tabs.read(recording.reader).pages["game"].has_scene
 
 
-@pytest.mark.parametrize("make", [PendulumEnv, lambda: SerialEnv(2, PendulumEnv)])
-def test_recorder_records_other_environments(tmp_path, make):
+@pytest.mark.parametrize(
+    ("make", "names"),
+    [
+        (PendulumEnv, ["swing-0", "swing-1"]),
+        (lambda: SerialEnv(2, PendulumEnv), ["swing-0, row 1", "swing-0, row 0", "swing-1, row 1", "swing-1, row 0"]),
+    ],
+)
+def test_recorder_records_other_environments(tmp_path, make, names):
     rows = (0,) if make is PendulumEnv else (1, 0)
     with lw.RerunLogger(tmp_path / "a.rrd") as logger:
         recorder = RolloutRecorder(logger, rows, objects=lambda rollout: {"tip": tip_of(rollout)}, task="swing")
         env = TransformedEnv(make(), Compose(StepCounter(max_steps=4), recorder))
-        rollouts = [env.rollout(6) for _ in range(2)]
+        first, _ = (env.rollout(6) for _ in range(2))
         env.reset()
         env.close()
-        names = ["swing-0", "swing-1"] if len(rows) == 1 else ["swing-0, row 1", "swing-0, row 0"]
-        assert logger.episodes[:2] == names
-        assert len(logger.episodes) == 2 * len(rows)
-    recording = Recording(tmp_path / "a.rrd")
-    first = rollouts[0] if len(rows) == 1 else rollouts[0][1]
-    root = "/swing-0" if len(rows) == 1 else "/swing-0\\,\\ row\\ 1"
+        assert logger.episodes == names
+    recording, first = Recording(tmp_path / "a.rrd"), first if len(rows) == 1 else first[1]
+    root = "/" + names[0].replace(",", "\\,").replace(" ", "\\ ")
     np.testing.assert_array_equal(recording.array(f"{root}/action", "Scalars:scalars"), first["action"].double())
     shown = recording.array(f"{root}/scene/objects/tip", "Points3D:positions")[:, 0]
     np.testing.assert_allclose(shown, tip_of(first), atol=1e-6)

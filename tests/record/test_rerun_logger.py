@@ -1,13 +1,11 @@
 """RerunLogger as a TorchRL logger: metrics, videos, hyperparameters and histograms are read back exactly."""
 
-import io
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from recordings import Recording
 from tensordict import TensorDict
 from torchrl.record.loggers import Logger
@@ -19,13 +17,10 @@ def test_rerun_logger_behaves_as_a_torchrl_logger(tmp_path):
     logger = RerunLogger(tmp_path / "runs" / "a.rrd")
     assert isinstance(logger, Logger)
     assert logger.start() is logger
-    assert logger.is_alive
-    assert logger.exp_name == "a"
-    assert logger.log_dir == str(tmp_path / "runs")
+    assert (logger.is_alive, logger.exp_name, logger.log_dir) == (True, "a", str(tmp_path / "runs"))
     assert "open" in repr(logger)
-    logger.shutdown()
-    logger.shutdown()
-    logger.close()
+    for close in (logger.shutdown, logger.shutdown, logger.close):
+        close()
     assert not logger.is_alive
     assert "closed" in repr(logger)
     with pytest.raises(RuntimeError, match="cannot be restarted"):
@@ -39,33 +34,36 @@ def test_scalars_are_read_back(tmp_path):
     with RerunLogger(tmp_path / "a.rrd", exp_name="run") as logger:
         for i in range(3000):
             logger.log_scalar("loss/bc", 1.0 / (i + 1), step=10 * i)
+    recording = Recording(tmp_path / "a.rrd")
+    loss = "/metrics/loss/bc", "Scalars:scalars"
+    assert recording.values(*loss) == [[1.0 / (i + 1)] for i in range(3000)]
+    assert recording.times(*loss, "global_step") == list(range(0, 30000, 10))
+
+
+def test_numbers_are_counted_and_several_of_one_name_are_several_curves(tmp_path):
+    with RerunLogger(tmp_path / "a.rrd") as logger:
         logger.log_scalar("counted", 1)
         logger.log_scalar("counted", torch.tensor([2.0]))
-        logger.log_metrics(TensorDict({"eval": {"success": torch.tensor(0.5)}}), step=7)
         logger.log_metrics({"nan": float("nan")}, step=0)
+        logger.log_scalar("eval/success", torch.tensor([[1.0, 2.0], [3.0, 4.0]]), step=1)
+        logger.log_metrics(TensorDict({"eval": {"success": torch.tensor([5.0, 6.0])}}), step=2)
+        logger.log_scalar("eval/success", True, step=3)
         for wrong in ("high", "1.5", None, torch.zeros(0), torch.zeros(65)):
             with pytest.raises(ValueError, match="loss/bc"):
                 logger.log_scalar("loss/bc", wrong)
         with pytest.raises(ValueError, match="name"):
             logger.log_scalar("loss//bc", 1.0)
+        state = logger.state_dict()
     recording = Recording(tmp_path / "a.rrd")
-    loss = "/metrics/loss/bc", "Scalars:scalars"
-    assert recording.values(*loss) == [[1.0 / (i + 1)] for i in range(3000)]
-    assert recording.times(*loss, "global_step") == list(range(0, 30000, 10))
     assert recording.times("/metrics/counted", "Scalars:scalars", "global_step") == [0, 1]
-    assert recording.values("/metrics/eval/success", "Scalars:scalars") == [[0.5]]
     assert np.isnan(recording.values("/metrics/nan", "Scalars:scalars")[0][0])
-
-
-def test_several_numbers_of_one_name_are_several_curves(tmp_path):
-    with RerunLogger(tmp_path / "a.rrd") as logger:
-        logger.log_scalar("eval/success", torch.tensor([[1.0, 2.0], [3.0, 4.0]]), step=1)
-        logger.log_metrics({"eval/success": torch.tensor([5.0, 6.0])}, step=2)
-        logger.log_scalar("eval/success", True, step=3)
-    recording = Recording(tmp_path / "a.rrd")
     assert recording.values("/metrics/eval/success", "Scalars:scalars") == [[1.0, 2.0, 3.0, 4.0], [5.0, 6.0], [1.0]]
     names = recording.values("/metrics/eval/success", "SeriesLines:names")
     assert names == [["success 0", "success 1", "success 2", "success 3"]]
+    with RerunLogger(tmp_path / "b.rrd") as logger:  # counters are saved and restored
+        logger.load_state_dict(state)
+        logger.log_scalar("counted", 1.0)
+    assert Recording(tmp_path / "b.rrd").times("/metrics/counted", "Scalars:scalars", "global_step") == [2]
 
 
 def test_each_group_of_metrics_has_a_view(tmp_path):
@@ -81,38 +79,16 @@ def test_each_group_of_metrics_has_a_view(tmp_path):
     }
 
 
-def test_counters_are_saved_and_restored(tmp_path):
-    with RerunLogger(tmp_path / "a.rrd") as logger:
-        logger.log_scalar("loss", 1.0)
-        logger.log_scalar("loss", 1.0)
-        state = logger.state_dict()
-    with RerunLogger(tmp_path / "b.rrd") as logger:
-        logger.load_state_dict(state)
-        logger.log_scalar("loss", 1.0)
-    assert Recording(tmp_path / "b.rrd").times("/metrics/loss", "Scalars:scalars", "global_step") == [2]
-
-
-def pixels(recording, entity):
-    """Return the images of an entity."""
-    blobs = recording.values(entity, "EncodedImage:blob")
-    return np.stack([np.asarray(Image.open(io.BytesIO(bytes(blob[0])))) for blob in blobs])
-
-
-def smooth(frames=4, channels=3, size=(24, 32)):
-    """Return a video without noise, which JPEG hardly changes."""
-    t, c, y, x = np.ogrid[:frames, :channels, : size[0], : size[1]]
-    return torch.as_tensor((10 * t + 30 * c + 3 * y + 2 * x).astype(np.uint8))
-
-
 @pytest.mark.parametrize("channels", [1, 3])
 def test_videos_are_read_back(tmp_path, channels):
-    video = smooth(channels=channels)
+    t, c, y, x = np.ogrid[:4, :channels, :24, :32]
+    video = torch.as_tensor((10 * t + 30 * c + 3 * y + 2 * x).astype(np.uint8))  # without noise, which JPEG changes
     with RerunLogger(tmp_path / "a.rrd") as logger:
         logger.log_video("plain", video)
         logger.log_video("batched", video[None], step=100, fps=10)
     recording = Recording(tmp_path / "a.rrd")
     for entity in ("/videos/plain", "/videos/batched/step\\ 100"):
-        shown = pixels(recording, entity).reshape(4, 24, 32, channels).astype(int)
+        shown = np.stack(recording.images(entity)).reshape(4, 24, 32, channels).astype(int)
         assert np.abs(shown - video.permute(0, 2, 3, 1).numpy()).max() < 12
     seconds = recording.times("/videos/batched/step\\ 100", "EncodedImage:blob", "time")
     assert [int(second) for second in seconds] == [0, 100_000_000, 200_000_000, 300_000_000]

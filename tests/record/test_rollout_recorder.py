@@ -20,14 +20,9 @@ def make(logger, tasks=("push", "reach"), *, rows=(0,), num_envs=2, length=8, **
 def content(path):
     """Return all columns with their times, except names that begin with the recording's id."""
     recording = Recording(path)
-    return {
-        (entity, component): (
-            None if recording.is_static(entity, component) else recording.times(entity, component),
-            recording.values(entity, component),
-        )
-        for entity, component in recording.columns
-        if not entity.startswith("/__") and component != "Transform3D:child_frame"
-    }
+    keys = [key for key in recording.columns if not key[0].startswith("/__") and key[1] != "Transform3D:child_frame"]
+    times = {key: None if recording.is_static(*key) else recording.times(*key) for key in keys}
+    return {key: (times[key], recording.values(*key)) for key in keys}
 
 
 def test_live_recording_equals_one_made_afterwards(tmp_path):
@@ -80,15 +75,9 @@ def test_rows_that_are_reset_or_stepped_alone_are_recorded(tmp_path):
 
 def test_a_collector_records(tmp_path):
     with lw.RerunLogger(tmp_path / "a.rrd") as logger:
-        collector = Collector(
-            make(logger, length=5),
-            lw.ScriptedSkillActor(PLANS),
-            frames_per_batch=16,
-            total_frames=32,
-            auto_register_policy_transforms=False,
-        )
-        for _ in collector:
-            pass
+        frames = {"frames_per_batch": 16, "total_frames": 32, "auto_register_policy_transforms": False}
+        collector = Collector(make(logger, length=5), lw.ScriptedSkillActor(PLANS), **frames)
+        list(collector)
         collector.shutdown()
         # 16 steps of each row: three episodes and one step.
         assert logger.episodes == ["push-0", "push-1", "push-2", "push-3"]

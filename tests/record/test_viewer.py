@@ -1,7 +1,6 @@
 """The viewer: opened at a tab and a step, in a browser, and drawing a picture."""
 
 import signal
-import stat
 import subprocess
 import sys
 import time
@@ -16,7 +15,7 @@ import torch
 from recordings import Recording, listens, skip_without_graphics_driver
 from tensordict import TensorDict
 
-from lw_torchrl._util import limits
+from lw_torchrl._util import files
 from lw_torchrl.record import RerunLogger, open_viewer, viewer
 from lw_torchrl.record.viewer import find_recordings, rerun_process
 
@@ -32,25 +31,21 @@ def write(path, steps=20, episodes=1):
     return logger.path
 
 
-def fake_viewer(tmp_path, monkeypatch, output, code):
-    script = tmp_path / "viewer"
-    script.write_text(f"#!/bin/sh\necho '{output}'\nexit {code}\n")
-    script.chmod(script.stat().st_mode | stat.S_IEXEC)
-    monkeypatch.setenv("RERUN_CLI_PATH", str(script))
+REMEDIES = {
+    "thread main panicked at Failed to get render context": "apt-get install libvulkan1 mesa-vulkan-drivers",
+    "Error: neither WAYLAND_DISPLAY nor DISPLAY is set.": "--screenshot",
+    "something else": "something else",
+}
 
 
-@pytest.mark.parametrize(
-    ("output", "message"),
-    [
-        ("thread main panicked at Failed to get render context", "apt-get install libvulkan1 mesa-vulkan-drivers"),
-        ("Error: neither WAYLAND_DISPLAY nor DISPLAY is set.", "--screenshot"),
-        ("something else", "something else"),
-    ],
-)
+@pytest.mark.parametrize(("output", "message"), REMEDIES.items())
 @pytest.mark.parametrize("screenshot", [None, "a.png"])
 def test_error_of_a_failing_viewer_names_the_remedy(tmp_path, monkeypatch, output, message, screenshot):
     write(tmp_path / "a.rrd")
-    fake_viewer(tmp_path, monkeypatch, output, 102)
+    script = tmp_path / "viewer"
+    script.write_text(f"#!/bin/sh\necho '{output}'\nexit 102\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("RERUN_CLI_PATH", str(script))
     with pytest.raises(RuntimeError, match=message):
         open_viewer(tmp_path / "a.rrd", None if screenshot is None else tmp_path / screenshot)
     assert not (tmp_path / "a.png").exists()
@@ -89,7 +84,7 @@ def test_forged_recordings_are_called_damaged(tmp_path, forge):
 
 def test_a_recording_that_is_never_read_to_its_end_is_damaged(tmp_path, monkeypatch):
     path = write(tmp_path / "a.rrd")
-    monkeypatch.setattr(limits, "_SECONDS", 1)
+    monkeypatch.setattr(files, "_SECONDS", 1)
     monkeypatch.setattr(viewer, "_READ", "while True: pass")
     with pytest.raises(ValueError, match=r"a\.rrd' is damaged .*limits of 1 s"):
         open_viewer(path)
@@ -122,11 +117,6 @@ def test_web_viewer_is_served_on_this_machine_until_interrupted(tmp_path):
     assert not listens(address.port)
 
 
-def test_a_folder_opens_all_its_recordings(tmp_path):
-    files = [write(tmp_path / "a.rrd") for _ in range(2)]
-    assert find_recordings(tmp_path) == files == [tmp_path / "a.rrd", tmp_path / "a-2.rrd"]
-
-
 def test_a_screenshot_has_the_window_size(tmp_path):
     write(tmp_path / "a.rrd")
     with skip_without_graphics_driver():
@@ -157,8 +147,9 @@ def seen(monkeypatch):
     return seen
 
 
-def test_several_recordings_open_at_their_own_steps(tmp_path, seen):
-    runs = [write(tmp_path / "a.rrd"), write(tmp_path / "b.rrd", steps=30)]
+def test_all_recordings_of_a_folder_open_at_their_own_steps(tmp_path, seen):
+    runs = [write(tmp_path / "a.rrd"), write(tmp_path / "a.rrd", steps=30)]
+    assert find_recordings(tmp_path) == runs == [tmp_path / "a.rrd", tmp_path / "a-2.rrd"]
     with skip_without_graphics_driver():
         open_viewer(runs)
     assert seen["cursors"] == [11, 16]
@@ -193,5 +184,5 @@ def test_episodes_side_by_side_come_before_their_own_tabs(tmp_path):
             with pytest.raises(ValueError, match="names"):
                 logger.compare(wrong)
     recording = Recording(tmp_path / "a.rrd")
-    assert recording.tabs() == ["Side by side", "reach", "reach-2"]
+    assert recording.saved_tabs() == [*recording.shown_tabs()] == ["Side by side", "reach", "reach-2"]
     assert recording.shown_tabs()["Side by side"] == ["reach", "reach-2"]

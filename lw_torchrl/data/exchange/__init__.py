@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from lw_torchrl._util.checks import Count, typed
-from lw_torchrl._util.files import AnyPath, parse_json, read_json, replacing_folder
-from lw_torchrl._util.limits import LimitError
+from lw_torchrl._util.files import AnyPath, LimitError, parse_json, read_json, replacing_folder
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.dataset import METADATA, Demonstrations, parse_metadata, read_metadata
 from lw_torchrl.data.exchange.imported import (

@@ -18,8 +18,7 @@ import torch
 from tensordict import TensorDict
 
 from lw_torchrl._util.checks import shown, unknown_name
-from lw_torchrl._util.files import replacing_folder
-from lw_torchrl._util.limits import run_limited
+from lw_torchrl._util.files import replacing_folder, run_limited
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour
