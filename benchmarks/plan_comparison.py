@@ -20,9 +20,9 @@ from benchmarks.figures import markdown_table, plot_sorted_tasks
 from benchmarks.many_plans import evaluate_plans
 from benchmarks.paper.published import published_plans
 from benchmarks.statistics import mean_rate
-from lw_torchrl._util.checks import differences
 from lw_torchrl._util.files import read_json, write_json, write_text
 from lw_torchrl._util.progress import Progress
+from lw_torchrl._util.reproducibility import differences
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plan_decoding import decode_plan
 from lw_torchrl.language.plan_files import save_plans

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from lw_torchrl._util.checks import differences
 from lw_torchrl._util.devices import CPU, check_device
 from lw_torchrl._util.files import locked
+from lw_torchrl._util.reproducibility import differences
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.language.plans import Plans

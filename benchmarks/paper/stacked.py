@@ -14,8 +14,9 @@ from torch.func import functional_call, stack_module_state, vmap
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
 
-from lw_torchrl._util.checks import differences, typed
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.devices import place
+from lw_torchrl._util.reproducibility import differences
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.training.checkpoint import check_can_be_saved, text_vectors
 from lw_torchrl.training.cloning import BehavioralCloningConfig

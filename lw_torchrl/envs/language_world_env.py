@@ -198,7 +198,7 @@ class LanguageWorldEnv(EnvBase):
     def _check_process(self) -> None:
         # The simulator's threads and its OpenGL context do not survive a fork: a child process would hang.
         if os.getpid() != self._process:
-            raise RuntimeError("this process was forked after the environment was made; pass a function that makes it")
+            raise RuntimeError("this process was forked after the environment was made: pass ParallelEnv a function")
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None) -> TensorDict:
         self._check_process()

@@ -203,7 +203,9 @@ class RowStates:
         """
         over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
         n, size = len(self.tasks), self.layout.action_size
-        executed = torch.zeros(n, size) if executed_action is None else torch.from_numpy(executed_action)
+        executed = (
+            torch.zeros(n, size, dtype=torch.float32) if executed_action is None else torch.from_numpy(executed_action)
+        )
         return TensorDict(
             {
                 "observation": torch.from_numpy(self.observation.copy()),

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from speed import within
-from test_canonical import GRASP, HELD, OWN, G, meanings, plan_of
+from test_canonical import OWN, G, meanings, plan_of
 
 import lw_torchrl as lw
 from lw_torchrl.language.canonical import canonical_plan, explain_canonical
@@ -19,6 +19,8 @@ from lw_torchrl.language.step_parser import parse_steps
 
 PARAPHRASES = json.loads((Path(__file__).parent / "sayings.json").read_text("utf-8"))
 """Skills of 30 shipped plans, and ten paraphrases of each by three writers who saw neither rules nor plans."""
+HELD = "gripper is near the stick handle and gripper is closed"
+GRASP = ("gripper is near the stick handle and gripper is open", "close the gripper around the stick")
 
 
 @pytest.mark.parametrize(

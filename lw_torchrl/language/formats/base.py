@@ -40,6 +40,17 @@ class PlanFormat:
     style: Style = Style()  # used for models that are constrained to a JSON Schema
 
 
+@dataclass(frozen=True)
+class Styled:
+    """A function whose last argument is a style; unlike a partial function, it can be pickled and compared."""
+
+    function: Callable[..., str]
+    style: Style
+
+    def __call__(self, *arguments: Any) -> str:
+        return self.function(*arguments, self.style)
+
+
 PROGRAM_WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "programs.toml", ValueError)
 """The words by which the readers recognize programs."""
 

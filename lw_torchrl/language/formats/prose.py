@@ -3,10 +3,9 @@
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 from lw_torchrl._util.checks import shown
-from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item
+from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, Styled, item
 from lw_torchrl.language.formats.markup import BULLET, WHEN, sentences, table_rules
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, one_line
@@ -19,7 +18,7 @@ def md(style: Style) -> PlanFormat:
     Source: paper section 'Conditional Plan Generation', which compared plans in prose with plans in code.
     """
 
-    return PlanFormat("md", partial(_write, style=style), ProseReading, partial(_prompt, style=style), style)
+    return PlanFormat("md", Styled(_write, style), ProseReading, Styled(_prompt, style), style)
 
 
 def _prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str], style: Style) -> str:

@@ -3,10 +3,19 @@
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 from lw_torchrl._util.checks import shown
-from lw_torchrl.language.formats.base import END, PROGRAM_WORDS, Clause, PlanFormat, Reading, Style, item, task_name
+from lw_torchrl.language.formats.base import (
+    END,
+    PROGRAM_WORDS,
+    Clause,
+    PlanFormat,
+    Reading,
+    Style,
+    Styled,
+    item,
+    task_name,
+)
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep, function_head, one_line, quote
 from lw_torchrl.language.queries import Query
@@ -23,7 +32,7 @@ def py(style: Style) -> PlanFormat:
     Source: paper section 'Conditional Plan Generation' and its figure of a plan.
     """
 
-    return PlanFormat("py", partial(_write, style=style), PythonReading, partial(_prompt, style=style), style)
+    return PlanFormat("py", Styled(_write, style), PythonReading, Styled(_prompt, style), style)
 
 
 def _prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str], style: Style) -> str:
@@ -62,9 +71,7 @@ _HELD = {"": "", _OPENED: ", open_gripper=True", _CLOSED: ", close_gripper=True"
 
 def py_md(style: Style) -> PlanFormat:
     """Build the format that writes a plan as a chat message with the function in a fenced code block."""
-    return PlanFormat(
-        "md", partial(_write_message, style=style), PythonReading, partial(_prompt_message, style=style), style
-    )
+    return PlanFormat("md", Styled(_write_message, style), PythonReading, Styled(_prompt_message, style), style)
 
 
 def _fenced(code: str) -> str:
