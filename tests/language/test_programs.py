@@ -240,15 +240,11 @@ def test_twenty_thousand_nested_parts_are_an_error_within_a_second(nested):
 
 
 def test_a_long_chain_of_elif_is_a_plan():
-    lines = ["def push(robot):", '    if check("the gripper is open"):', '        robot.wave("0")']
+    rows = ["def push(robot):", '    if check("the gripper is open"):', '        robot.wave("0")']
     for number in range(150):
-        lines += [
-            f'    elif check("the puck is near the target location {number}"):',
-            f'        robot.wave("{number}")',
-        ]
-    assert (
-        len(lw.ConditionalPlan.from_program("\n".join(lines), "push").steps) == 2
-    )  # all others are the same condition
+        rows += [f'    elif check("the puck is near the target location {number}"):', f'        robot.wave("{number}")']
+    plan = lw.ConditionalPlan.from_program("\n".join(rows), "push")
+    assert len(plan.steps) == 2  # all others are the same condition
 
 
 DEEP = {
