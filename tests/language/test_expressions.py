@@ -1,4 +1,4 @@
-"""Boolean expressions: normal form, sharing, and truth."""
+"""Boolean expressions: normal form, sharing, truth, and the outline of guards."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import product
 
 import pytest
 from conditions import build
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from speed import within
 
@@ -20,6 +20,7 @@ from lw_torchrl.language.expressions import (
     Expression,
     all_of,
     any_of,
+    as_expression,
     count_mentions,
     evaluate,
     fold,
@@ -28,6 +29,7 @@ from lw_torchrl.language.expressions import (
     negate,
     replace_leaves,
 )
+from lw_torchrl.language.outline import outline
 
 LEAVES = "abcd"
 # Trees of ("all" | "any" | "not", parts) that are interpreted directly.
@@ -144,3 +146,30 @@ def test_depth_is_not_limited_and_unused_nodes_are_freed() -> None:
 def test_wide_expressions_are_refused() -> None:
     with pytest.raises(ValueError, match="at most 1000 parts"):
         any_of(map(str, range(1_001)))
+
+
+guards = st.recursive(
+    st.sampled_from([*map(as_expression, LEAVES), *map(negate, LEAVES), TRUE, FALSE]),
+    lambda inner: st.builds(lambda join, parts: join(parts), st.sampled_from((all_of, any_of)), st.lists(inner)),
+    max_leaves=6,
+)
+
+
+@settings(max_examples=300)
+@given(st.lists(guards, max_size=6))
+def test_an_outline_means_the_guards(guards) -> None:
+    """The conditions above a step, with those that "else" excludes, are the step's guard."""
+    lines = outline(guards)
+    assert [line.steps[0] for line in lines if not line.head] == list(range(len(guards)))
+    for truth in STATES:
+        path, chain = [], {}  # whether the open branches hold, and for each depth, no branch above did
+        for line in lines:
+            del path[line.depth :]
+            chain = {depth: none for depth, none in chain.items() if depth <= line.depth}
+            if not line.head:
+                assert all(path) == evaluate(guards[line.steps[0]], truth)
+                continue
+            before = line.head == "if" or chain[line.depth]
+            holds = line.condition is None or evaluate(line.condition, truth)
+            path.append(before and holds)
+            chain[line.depth] = before and not holds

@@ -5,6 +5,7 @@ import random
 from typing import NamedTuple
 
 import pytest
+from cases import read_cases
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from plan_texts import read_table
@@ -94,22 +95,7 @@ def test_thoughts_without_an_answer_are_not_a_plan(tag):
     ]
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
-        ("<think>\nFirst I thought:\n{}\nNo.</think>\n", ""),
-        ("<Thinking>\n{}</think>\n", ""),
-        ("{}\nNo.</think>\n", ""),
-        ("[THINK]{}\nNo.[/THINK]", ""),
-        ("<|channel|>analysis<|message|>{}<|end|><|start|>assistant<|channel|>final<|message|>", ""),
-        ("<|channel|>analysis<|message|>{}\n<|channel|>final <|constrain|>json<|message|>", ""),
-        ("<think>one</think>\n<think>{}</think>\n", ""),
-        ("<think>Is </think> the end? <think>{}\n</think>\n", ""),
-        ("{}\nSo be it. [/THINK]\n", ""),
-        ('{}\nThat is #2, "push it".</think>\n', ""),
-        ("", "\n<think>\n{}\n</think>\n"),
-    ],
-)
+@pytest.mark.parametrize(("before", "after"), read_cases("language/values.toml")["thoughts"])
 def test_thoughts_of_many_models(before, after):
     plans = lw.load_plans("MT10")
     draft, final = (lw.encode_plan(lw.ConditionalPlan("push", plans["push"].steps[:n]), "chain_py") for n in (3, 2))
@@ -200,17 +186,7 @@ def test_the_scripted_plan_has_the_task_s_nearest_skills():
     lw.ScriptedSkillActor(lw.Plans([found.scripted]))
 
 
-@pytest.mark.parametrize(
-    ("skill", "scripted"),
-    [
-        ('grab("puck")', "close the gripper around the puck"),
-        ('put("gripper around puck")', "lower the gripper around the puck"),
-        ('drop("gripper around the puck")', "lower the gripper around the puck"),
-        ('put("gripper above puck")', "place the gripper above the puck"),
-        ('place("puck at goal")', "move the puck to the target location"),
-        ('slide("the puck to target")', "move the puck to the target location"),
-    ],
-)
+@pytest.mark.parametrize(("skill", "scripted"), read_cases("language/steps.toml")["scripted"])
 def test_skills_in_models_words(skill, scripted):
     found = lw.decode_plan(f'if check("gripper open"):\n    robot.{skill}', "push", "basic_py")
     assert found.scripted.steps[0].skill == scripted

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from cases import read_cases
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plan_texts import DRAWER, HEAD, conditional_plans, plan
@@ -14,6 +15,8 @@ from lw_torchrl.language.plan_files import PLAN_LIMIT, check_plan, load_plans, p
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep
 from lw_torchrl.language.queries import check_query, parse_query
 from lw_torchrl.language.tasks import MT50, TASKS, Task
+
+CASES = read_cases("language/plan_files.toml")
 
 # ---- parsing
 
@@ -47,26 +50,7 @@ def test_indentation_and_spaces_are_ignored():
     assert parse_plan(text).steps == plan().steps
 
 
-@pytest.mark.parametrize(
-    ("task", "written", "skill"),
-    [
-        ("push", 'robot.place("gripper above puck")', "place the gripper above the puck"),  # the paper's example
-        ("push", 'robot.place("the gripper above the puck")', "place the gripper above the puck"),
-        ("push", 'robot.place("the robot\'s gripper above the  puck")', "place the robot's gripper above the puck"),
-        ("push", 'robot.move("its gripper to an open pose")', "move its gripper to an open pose"),
-        ("push", 'robot.slide("puck to target location")', "slide the puck to the target location"),
-        ("push", 'robot.move("puckish things")', "move puckish things"),
-        ("push", 'robot.let_go("puck")', "let go the puck"),
-        ("push", 'robot.place_gripper("above puck")', "place the gripper above the puck"),
-        ("push", "robot.wait()", "wait"),
-        ("door-lock", 'robot.turn("door\'s lock")', "turn the door's lock"),
-        ("window-open", "robot.push('window handle')", "push the window handle"),
-        # No article in the middle of a longer noun.
-        ("coffee-push", 'robot.grab("the white coffee mug")', "grab the white coffee mug"),
-        ("box-close", 'robot.put("gripper above box lid")', "put the gripper above the box lid"),
-        ("soccer", 'robot.move("the soccer ball to goal")', "move the soccer ball to the goal"),
-    ],
-)
+@pytest.mark.parametrize(("task", "written", "skill"), CASES["articles"])
 def test_articles_are_added_to_nouns(task, written, skill):
     text = f"def {task.replace('-', '_')}(robot):\n  if check('gripper open'):\n    {written}\n"
     assert parse_plan(text).steps[0].skill == skill
@@ -76,39 +60,11 @@ def test_articles_are_added_to_nouns(task, written, skill):
 OPEN = "    if check('gripper open'):\n"
 
 
-@pytest.mark.parametrize(
-    ("text", "line", "part"),
-    [
-        ("", None, "no plan found"),
-        ("# only a comment\n\n", None, "no plan found"),
-        ('if check("the gripper is open"):\n    robot.push("puck")\n', 1, "def task_name(robot):"),
-        ("Sure, here is a plan:\n" + HEAD, 1, "def task_name(robot):"),
-        (HEAD.replace("push(robot)", "pusch(robot)"), 1, "'push'"),
-        (HEAD.replace("push(robot)", "push()"), 1, "def task_name(robot):"),
-        (HEAD + HEAD, 4, "second plan"),
-        (HEAD + "    robot.push('puck')\n", 4, "no condition"),
-        (HEAD + OPEN, None, "no skill"),
-        (HEAD + OPEN + OPEN, 5, "a second condition"),
-        (HEAD + "    if check('the gripper is happy'):\n        robot.push('puck')\n", 4, "nearest query"),
-        (HEAD + "    if check('gripper above drawer handle'):\n        robot.push('puck')\n", 4, "'drawer'"),
-        (HEAD + "    if check(''):\n        robot.push('puck')\n", 4, "a condition"),
-        (HEAD + OPEN + "        robot.push('puck', goal='the gripper is wet')\n", 5, "goal: "),
-        (HEAD + "    else:\n        robot.push('puck')\n", 4, "'else:'"),
-        (HEAD + "    if check(gripper_open):\n", 4, "if check"),
-        (HEAD + "    if check('gripper open') and True:\n", 4, "if check"),
-        (HEAD + "    if check('gripper open'): robot.push('puck')\n", 4, "if check"),
-        (HEAD + "    if check('gripper open\"):\n", 4, "if check"),
-        (HEAD + OPEN + "        robot.push('puck', 3)\n", 5, "robot.verb"),
-        (HEAD + OPEN + "        robot._push('puck')\n", 5, "robot.verb"),
-        (HEAD + OPEN + "        human.push('puck')\n", 5, "robot.verb"),
-        (HEAD + OPEN + "        robot.push('puck').pull('puck')\n", 5, "robot.verb"),
-        (HEAD + "    return\n", 4, "'return'"),
-    ],
-)
+@pytest.mark.parametrize(("text", "line", "part"), CASES["faults"])
 def test_an_error_names_the_source_the_line_and_the_fault(text, line, part):
     with pytest.raises(PlanError) as caught:
-        parse_plan(text, source="my.plan")
-    assert str(caught.value).startswith("my.plan: " if line is None else f"my.plan, line {line}: ")
+        parse_plan(text.replace("{HEAD}", HEAD), source="my.plan")
+    assert str(caught.value).startswith(f"my.plan, line {line}: " if line else "my.plan: ")
     assert part in str(caught.value)
 
 

@@ -33,28 +33,17 @@ def test_the_fingerprint_depends_on_queries_skills_and_objects():
     plans = of()
     reasons = [replace(step, reason="why") for step in plans["push"].steps]
     words = Task("push", "Other words.", TASKS["push"].objects)
-    same = [
-        of(),
-        Plans([ConditionalPlan("push", tuple(reasons))]),
-        of(words),
-        of(pairs=[("gripper near puck", "wait"), PUSH[1]]),
-    ]
+    same = [of(), Plans([ConditionalPlan("push", tuple(reasons))]), of(words)]
+    same.append(of(pairs=[("gripper near puck", "wait"), PUSH[1]]))
     assert {each.fingerprint for each in same} == {plans.fingerprint}
     assert len(plans.fingerprint) == 32
     int(plans.fingerprint, 16)
     reach = ConditionalPlan.from_pairs("reach", PUSH[1:])
     sweep = ConditionalPlan.from_pairs("reach", PUSH[1:] * 3)
-    other = [
-        of(pairs=PUSH[::-1]),
-        of(pairs=PUSH[:1]),
-        of(pairs=[PUSH[0], ("the gripper is closed", PUSH[1][1])]),
-        of(pairs=[PUSH[0], (PUSH[1][0], "wait")]),
-        of(moved(0.01)),
-        of(moved(-0.01)),
-        of(Task("push", "Push.", TASKS["push"].objects[:2])),
-        Plans({"push": plans["push"], "reach": reach}),
-        Plans({"push": plans["push"], "reach": sweep}),
-    ]
+    changed = PUSH[::-1], PUSH[:1], [PUSH[0], ("the gripper is closed", PUSH[1][1])], [PUSH[0], (PUSH[1][0], "wait")]
+    tasks = moved(0.01), moved(-0.01), Task("push", "Push.", TASKS["push"].objects[:2])
+    other = [*(of(pairs=pairs) for pairs in changed), *map(of, tasks)]
+    other += [Plans({"push": plans["push"], "reach": plan}) for plan in (reach, sweep)]
     assert len({each.fingerprint for each in [plans, *other]}) == len(other) + 1
 
 

@@ -181,3 +181,18 @@ def test_a_task_without_the_goal_s_objects_has_no_usual_goal():
     bare = dataclasses.replace(task, objects=task.objects[:2])
     assert usual_goal(skill, bare) is None
     assert ConditionalPlan.from_pairs(bare, [("gripper open", skill)]).goals == (None,)
+
+
+def test_plans_queries_and_answers_do_without_torch(python):
+    program = """
+import sys, numpy as np, lw_torchrl as lw, lw_torchrl.language.canonical
+from lw_torchrl.language.nearest import nearest_query
+plans = lw.canonical_plans(lw.load_plans("MT50"), fallback=True)
+assert lw.Plans.from_json(plans.to_json()) == plans
+assert lw.parse_query("the gripper above the puck", "push") == nearest_query("gripper over the puck", "push").query
+assert lw.decode_plan(lw.encode_plan(lw.load_plans("MT10")["push"], "chain_py"), "push", "chain_py").all_scripted
+assert lw.TASKS["push"].positions(np.arange(39.0))["puck"].tolist() == [4.0, 5.0, 6.0]
+print(sorted({"torch", "tensordict", "torchrl", "numba", "mujoco"} & set(sys.modules)))
+"""
+    done = python(program)
+    assert done.stdout.strip() == "[]", done.stderr

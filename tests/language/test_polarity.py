@@ -1,6 +1,7 @@
 """No reading of a sentence means the opposite: negations and opposites are kept, or left out with a note."""
 
 import pytest
+from cases import read_cases
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from plan_texts import read_table
@@ -15,33 +16,8 @@ from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import GOAL
 
+CASES = read_cases("language/polarity.toml")
 TASKS = ("push", "drawer-open", "stick-pull", "reach")
-# Each negates the sentence "the SUBJECT is PREDICATE".
-NEGATED = (
-    "the {subject} isn't {rest}",
-    "the {subject} is no longer {rest}",
-    "the {subject} is never {rest}",
-    "the {subject} cannot be {rest}",
-    "the {subject} should not be {rest}",
-    "the {subject} is not yet {rest}",
-    "the {subject} is anything but {rest}",
-    "the {subject} is other than {rest}",
-    "the {subject} fails to be {rest}",
-    "the {subject} avoids being {rest}",
-    "the {subject} is hardly {rest}",
-    "the {subject} is neither {rest} nor so",
-    "it is not the case that the {subject} is {rest}",
-    "it is false that the {subject} is {rest}",
-    "unless the {subject} is {rest}",
-    "do not let the {subject} be {rest}",
-    "without the {subject} being {rest}",
-    "except when the {subject} is {rest}",
-    "no part of the {subject} is {rest}",
-)
-FAR = (
-    "far from", "away from", "clear of", "out of reach of", "well away from", "far away from", "nowhere near",
-    "outside",
-)  # fmt: skip
 
 
 def implies(first, second):
@@ -66,9 +42,13 @@ def negations(draw):
     task = lw.TASKS[draw(st.sampled_from(TASKS))]
     clause = draw(st.sampled_from([c for c in base_clauses(task, tuple(PREDICATES)) if not c.negated]))
     if clause.predicate == "near" and draw(st.booleans()):
-        return task, Query((clause,)), f"the {clause.subject} is {draw(st.sampled_from(FAR))} the {clause.object}"
+        return (
+            task,
+            Query((clause,)),
+            f"the {clause.subject} is {draw(st.sampled_from(CASES['far']))} the {clause.object}",
+        )
     rest = str(clause).removeprefix(f"the {clause.subject} is ")
-    return task, Query((clause,)), draw(st.sampled_from(NEGATED)).format(subject=clause.subject, rest=rest)
+    return task, Query((clause,)), draw(st.sampled_from(CASES["negated"])).format(subject=clause.subject, rest=rest)
 
 
 @given(negations())
@@ -107,14 +87,7 @@ def test_opposite_relations_are_not_confused(task, data):
     assert all(clause.predicate != words[written] for clause in query.clauses)
 
 
-FORBIDDEN = (
-    "do not {}", "don't {}", "never {}", "not {}", "must not {}", "avoid letting anything {}", "refrain from it: {}",
-    "anything but {}", "neither {} nor wait", "no longer {}", "make sure not to {}", "do not let it {}",
-    "under no circumstances {}",
-)  # fmt: skip
-
-
-@given(st.sampled_from(sorted(load_skills())), st.sampled_from(FORBIDDEN))
+@given(st.sampled_from(sorted(load_skills())), st.sampled_from(CASES["forbidden"]))
 @example("close the gripper around the puck", "do not {}")
 def test_a_forbidden_skill_is_in_no_plan(skill, pattern):
     text = pattern.format(skill)
@@ -132,12 +105,7 @@ def test_a_forbidden_skill_is_in_no_plan(skill, pattern):
         assert len(report.left_out) == 1
 
 
-@pytest.mark.parametrize(
-    "skill",
-    ["move the gripper away from the mug", "stay clear of the mug", "keep the gripper off the mug",
-     "stop pushing the mug",
-     "move the mug away from the target location", "back off from the mug", "raise the gripper unless it is open"],
-)  # fmt: skip
+@pytest.mark.parametrize("skill", CASES["away"])
 def test_moving_away_is_not_read_as_moving_there(skill):
     plan = lw.ConditionalPlan.from_pairs("coffee-push", [("the gripper is near the mug", skill)])
     assert explain_canonical(plan).read == ()
@@ -170,26 +138,13 @@ NEAR, FAR_AWAY = "the gripper is near the mug", "the gripper is not near the mug
 OPEN = "open the gripper"
 
 
-@pytest.mark.parametrize(
-    ("skill", "words"),
-    [
-        ("carry the mug beyond the target location", "beyond"),
-        ("push the mug nearly to the target location", "nearly"),
-        ("carry the mug three inches behind the target location", "three inches"),
-        ("carry the mug to the target location, but stop before it", "but stop"),
-    ],
-)
+@pytest.mark.parametrize(("skill", "words"), CASES["qualifiers"])
 def test_a_qualifier_that_no_step_can_express_is_named(skill, words):
     decoded = lw.decode_plan(f"- When {NEAR}, the robot should {skill}.", "coffee-push", "basic_md")
     assert any(words in note.text for note in decoded.notes)
 
 
-@pytest.mark.parametrize(
-    "frame",
-    ["postpone {}ing the mug to the target location", "it is no use to {} the mug", "dream about {}ing the mug",
-     "hinder the mug from {}ing", "{}ing the mug is out of the question", "cancel the {} of the mug",
-     "hesitate to {} the mug to the target location"],
-)  # fmt: skip
+@pytest.mark.parametrize("frame", CASES["unknown"])
 @pytest.mark.parametrize("verb", ["push", "pull", "lift"])
 def test_an_action_in_an_unknown_frame_is_not_done(frame, verb):
     skill = frame.format(verb)
@@ -200,20 +155,7 @@ def test_an_action_in_an_unknown_frame_is_not_done(frame, verb):
     assert report.left_out == (skill,)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "Avoid lifting the mug while the gripper is near the mug.",
-        "When the gripper is near the mug, the robot mustn't lift the mug.",
-        "When the gripper is near the mug, it is prohibited to lift the mug.",
-        "When the gripper is near the mug, the mug can't be lifted.",
-        "Caution: lifting the mug is not allowed.",
-        "Never, ever lift the mug.",
-        "Do not, under any circumstances, lift the mug.",
-        "Nobody may lift the mug.",
-        "Do not let the robot lift the mug.",
-    ],
-)
+@pytest.mark.parametrize("text", CASES["prohibitions"])
 @pytest.mark.parametrize("line", ["{}", "- {}", "**Warning:** {}", "2. {}"])
 def test_a_prohibition_is_named_in_a_note(text, line):
     decoded = lw.decode_plan(f"1. If {FAR_AWAY}, {OPEN}.\n{line.format(text)}\n", "coffee-push")
@@ -251,15 +193,7 @@ def test_an_uncertain_place_has_no_script(place):
     assert StepMapper(lw.TASKS["push"], None).skill(f"move the puck {place} the target location")[0] is None
 
 
-@pytest.mark.parametrize(
-    ("text", "wrong"),
-    [
-        ("it is 8 o'clock", "closed"),
-        ("the puck is floating over the table", "touching the table"),
-        ("the puck is not near the gripper not above it", "is above"),
-        ("it is doubtful that the gripper is near the puck", "is near"),
-    ],
-)
+@pytest.mark.parametrize(("text", "wrong"), CASES["wrong"])
 def test_a_condition_without_a_word_for_the_state_is_not_that_state(text, wrong):
     match = nearest_query(text, "push")
     assert match.least_score < 0.6 or wrong not in str(match.query)

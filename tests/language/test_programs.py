@@ -6,15 +6,18 @@ from contextlib import suppress
 from itertools import product
 
 import pytest
+from cases import read_cases
+from conditions import visit_with_memory
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from speed import within
 
 import lw_torchrl as lw
 from lw_torchrl.language.canonical import explain_canonical
-from lw_torchrl.language.expressions import evaluate, negate
+from lw_torchrl.language.expressions import as_expression, evaluate, fold, negate
 from lw_torchrl.language.formats.code import CodeReading
 from lw_torchrl.language.library import LIBRARY
+from lw_torchrl.language.plan_files import parse_plan
 from lw_torchrl.language.programs import (
     Action,
     Block,
@@ -30,6 +33,7 @@ from lw_torchrl.language.programs import (
 )
 from lw_torchrl.language.queries import parse_query
 
+CASES = read_cases("language/queries.toml")
 LEAVES = ("a", "b", "c", "d")
 STATES = [dict(zip(LEAVES, truth, strict=True)) for truth in product((False, True), repeat=len(LEAVES))]
 
@@ -236,15 +240,11 @@ def test_twenty_thousand_nested_parts_are_an_error_within_a_second(nested):
 
 
 def test_a_long_chain_of_elif_is_a_plan():
-    lines = ["def push(robot):", '    if check("the gripper is open"):', '        robot.wave("0")']
+    rows = ["def push(robot):", '    if check("the gripper is open"):', '        robot.wave("0")']
     for number in range(150):
-        lines += [
-            f'    elif check("the puck is near the target location {number}"):',
-            f'        robot.wave("{number}")',
-        ]
-    assert (
-        len(lw.ConditionalPlan.from_program("\n".join(lines), "push").steps) == 2
-    )  # all others are the same condition
+        rows += [f'    elif check("the puck is near the target location {number}"):', f'        robot.wave("{number}")']
+    plan = lw.ConditionalPlan.from_program("\n".join(rows), "push")
+    assert len(plan.steps) == 2  # all others are the same condition
 
 
 DEEP = {
@@ -266,40 +266,15 @@ def test_hostile_programs_are_read_in_time_without_an_error(name):
         lw.decode_plan(DEEP[name], "push")
 
 
-NEGATIONS = {
-    "the gripper isn't near or above the puck": "the gripper is not near the puck and not above the puck",
-    "the gripper is above the puck and neither open nor near it": "gripper above puck and not open and not near puck",
-    "it is (not) near the puck": "the gripper is not near the puck",
-    "the gripper is near the puck (but not closed)": "the gripper is near the puck and not closed",
-    "you don't have the puck": "the gripper is not around the puck",
-    "the puck isn't held": "the gripper is not around the puck",
-    "near the puck, not open, and not above it": "the gripper is near the puck and not open and not above the puck",
-    "the gripper is not (near the puck or above it)": "the gripper is not near the puck and not above the puck",
-}
-
-
-@pytest.mark.parametrize("text", NEGATIONS)
-def test_conditions_in_prose_keep_their_negations(text):
+@pytest.mark.parametrize(("text", "query"), CASES["prose"])
+def test_conditions_in_prose_keep_their_negations(text, query):
     plan = lw.decode_plan(f"Stop if {text}. Otherwise, push the puck.", "push").plan
-    assert plan.steps[0].condition == parse_query(NEGATIONS[text], "push")
+    assert plan.steps[0].condition == parse_query(query, "push")
 
 
-def test_two_subjects_may_share_a_predicate():
-    for text, same in (
-        (
-            "neither the gripper nor the puck is near the target location",
-            "gripper not near target location and puck not near target location",
-        ),
-        (
-            "both the gripper and the puck are near the target location",
-            "gripper near target location and puck near target location",
-        ),
-        (
-            "either the gripper or the puck is not above the target location",
-            "gripper not above target location or puck not above target location",
-        ),
-    ):
-        assert parse_query(text, "push") == parse_query(same, "push")
+@pytest.mark.parametrize(("text", "same"), CASES["shared"])
+def test_two_subjects_may_share_a_predicate(text, same):
+    assert parse_query(text, "push") == parse_query(same, "push")
 
 
 def test_yaml_without_pyyaml_gives_a_note(monkeypatch):
@@ -349,3 +324,86 @@ def test_every_action_of_a_behaviour_tree_is_kept():
         "the robot's gripper is not open and the robot's gripper is not near the puck",
         "the robot's gripper is not open and the robot's gripper is near the puck",
     ]
+
+
+# ---- sequences with memory and the perfect tense, which become latches
+
+literals = st.builds(
+    lambda name, negated: negate(name) if negated else as_expression(name), st.sampled_from(LEAVES), st.booleans()
+)
+effects = st.sampled_from(LEAVES).map(lambda name: Action(f"do {name}"))  # the effect of "do a" is a
+
+
+def sequences(parts):
+    return st.builds(
+        lambda listed, memory: Sequence(tuple(listed), memory), st.lists(parts, min_size=1, max_size=3), st.booleans()
+    )
+
+
+stateful = st.recursive(
+    effects | st.builds(Check, literals),
+    lambda parts: sequences(parts) | st.builds(Branch, literals, parts, st.none() | parts),
+    max_leaves=8,
+).map(lambda node: Sequence((node, Action("do a")), memory=True))
+
+
+class Ticker:
+    """A behaviour tree that is ticked at each control step; a sequence with memory stores its next part."""
+
+    def __init__(self):
+        self.next = {}
+
+    def tick(self, node, truth, path=()):
+        """Return the status and the active actions."""
+        if isinstance(node, Action):
+            return "success" if truth[node.text[-1]] else "running", [node.text]
+        if isinstance(node, Check):
+            return "success" if evaluate(node.condition, truth) else "failure", []
+        if isinstance(node, Branch):
+            if evaluate(node.condition, truth):
+                return self.tick(node.then, truth, (*path, 0))
+            return ("success", []) if node.otherwise is None else self.tick(node.otherwise, truth, (*path, 1))
+        active = []
+        for number in range(self.next.get(path, 0) if node.memory else 0, len(node.parts)):
+            status, active = self.tick(node.parts[number], truth, (*path, number))
+            if status != "success":
+                return status, active
+            if node.memory:
+                self.next[path] = number + 1
+                active = []
+        return "success", active
+
+
+@given(stateful, st.lists(st.fixed_dictionaries({name: st.booleans() for name in LEAVES}), max_size=8))
+def test_compiled_trees_with_memory_act_like_ticked_trees(tree, states):
+    steps = compile_program(tree, lambda text: text[-1])
+    ticker, latched = Ticker(), set()
+    for truth in states:
+        _, expected = ticker.tick(tree, truth)
+        holds_now = visit_with_memory(truth, latched)
+        truths = [fold(step.guard, holds_now) for step in steps]  # of each step, so that each latch is visited
+        assert [step.action.text for step, active in zip(steps, truths, strict=True) if active] == expected
+
+
+TREE = {
+    "children": [
+        {"type": "condition", "name": "the gripper is open"},
+        {"type": "action", "name": "move the gripper above the puck"},
+        {"type": "action", "name": "close the gripper"},
+    ]
+}
+
+
+def test_spellings_of_a_sequence_with_memory():
+    kinds = [{"type": kind} for kind in ("SequenceStar", "sequence_with_memory", "Sequence*")]
+    texts = [json.dumps({**kind, **TREE}) for kind in [*kinds, {"type": "sequence", "memory": True}]]
+    texts.append(json.dumps({"sequence_with_memory": TREE["children"]}))
+    for plan in [lw.decode_plan(text, "push").plan for text in texts]:
+        opened = "the robot's gripper has been open"
+        above = f"once ({opened} and the robot's gripper is above the puck)"
+        closed = f"once ({above} and the robot's gripper is closed)"
+        conditions = [str(step.condition) for step in plan.steps]
+        assert conditions == [f"{opened} and not {above}", f"{above} and not {closed}"]
+        assert parse_plan(str(plan), "push") == plan
+    without = lw.decode_plan(json.dumps({"type": "sequence", **TREE}), "push").plan
+    assert not any(step.condition.has_latch for step in without.steps)

@@ -13,7 +13,7 @@ from conditions import interpret, query_of, tower, trees
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from speed import within
-from states import all_tasks, observation, random_states
+from states import all_tasks, random_states
 from tensordict import TensorDict
 
 from lw_torchrl.language import query_program
@@ -74,13 +74,6 @@ def test_it_answers_on_the_device_of_the_observation(batch):
     answer = program(states.cuda(), ids.cuda())
     assert answer.is_cuda
     assert torch.equal(answer.cpu(), program(states, ids))
-
-
-def test_a_task_object_may_be_the_key():
-    mine = Task("push", "Push it.", (NamedObject(GRIPPER, (0, 1, 2)), NamedObject("block", (11, 12, 13))))
-    program = QueryProgram({mine: ["the gripper is near the block"]})
-    near = observation(hand=[0.1, 0.6, 0.2], two=[0.1, 0.6, 0.21], one=[0.5, 0.9, 0.5])
-    assert program(near, torch.tensor(task_id("push"))).tolist() == [True]
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import language_world as oracle
 import numpy as np
 import pytest
 import torch
+from cases import read_cases
 from states import REAL, observation, random_states, real_states
 
 from lw_torchrl.language.queries import parse_query, supported_queries
@@ -103,22 +104,7 @@ def test_queries_that_are_parsed_but_not_listed():
     assert (same == [[closed, closed, not closed, not closed] for closed in same[:, 0]]).all()
 
 
-@pytest.mark.parametrize(
-    ("query", "at", "expected"),
-    [
-        ("gripper open", {"opening": 0.75}, False),
-        ("gripper closed", {"opening": 0.75}, True),
-        ("gripper open", {"opening": np.nextafter(np.float32(0.75), np.float32(1))}, True),
-        ("puck touching the table", {"one": [0.0, 0.6, 0.02]}, True),
-        ("puck touching the table", {"one": [0.0, 0.6, np.nextafter(np.float32(0.02), np.float32(1))]}, False),
-        ("gripper above puck", {"hand": [0.1, 0.6, 0.2], "one": [0.1, 0.6, 0.2]}, False),
-        ("gripper below puck", {"hand": [0.1, 0.6, 0.2], "one": [0.1, 0.6, 0.2]}, False),
-        ("gripper left of puck", {"hand": [0.04, 0.0, 0.0]}, False),
-        ("gripper right of puck", {"hand": [-0.04, 0.0, 0.0]}, False),
-        ("gripper near puck", {"hand": [0.04, 0.0, 0.0]}, False),
-        ("gripper not near puck", {"hand": [0.04, 0.0, 0.0]}, True),
-    ],
-)
+@pytest.mark.parametrize(("query", "at", "expected"), read_cases("language/queries.toml")["thresholds"])
 def test_on_the_threshold_float32_answers_as_published(query, at, expected):
     state = observation(**at)
     assert QueryProgram({"push": [query]})(state, torch.tensor(task_id("push"))).tolist() == [expected]

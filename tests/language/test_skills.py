@@ -5,13 +5,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from states import observation
 
 import lw_torchrl as lw
 from lw_torchrl.language.nearest import nearest_skill
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.skill_program import SkillProgram
-from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, skills_for
+from lw_torchrl.language.skills import SkillError, load_skills, skills_for
 
 
 def written(tmp_path, text):
@@ -140,13 +139,6 @@ def test_any_leading_shape_and_precision():
     actions = PROGRAM(state, ids)
     assert (actions.shape, actions.dtype) == ((2, 3, PLANS.num_steps, 4), torch.float32)
     assert torch.equal(PROGRAM(state[0, 1], ids[0, 1]), actions[0, 1])
-
-
-def test_an_object_moved_and_an_axis_left_alone():
-    carry = ScriptedSkill("carry", "target location", moved="puck", gain=(10.0, 0.0, 100.0), gripper=1.0)
-    state = observation(one=[0.1, 0.5, 0.0], goal=[0.13, 0.9, 0.2])
-    action = SkillProgram({"push": [carry]})(state, torch.tensor(lw.task_id("push")))
-    assert action[0].tolist() == pytest.approx([0.3, 0.0, 1.0, 1.0])
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import json
 from importlib.resources import files
 from inspect import signature
+from pathlib import Path
 from pydoc import render_doc
 
 import language_world as oracle
@@ -300,31 +301,13 @@ def test_a_missing_or_unreadable_file_of_tasks(tmp_path):
 # ---- a 51st task, from its plan to an action
 
 
+STACKING = Path(__file__).parent / "stack_blocks"
+
+
 @pytest.fixture
-def stacking(tmp_path):
-    (tmp_path / "tasks.toml").write_text("""
-[stack-blocks]
-description = "Put the block on the tower."
-objects.block = "obs[4:7]"
-objects.tower = "obs[11:14]"
-points."tower top" = { object = "tower", offset = [0.0, 0.0, 0.1] }
-""")
-    (tmp_path / "stack-blocks.plan").write_text("""def stack_blocks(robot):
-    if check("the gripper is not near the block"):
-        robot.place("the gripper around the block")
-    if check("the block is not above the tower top"):
-        robot.move("the block above the tower top")
-""")
-    (tmp_path / "skills.toml").write_text("""
-["place the gripper around the block"]
-target = "block"
-["move the block above the tower top"]
-target = "tower top"
-moved = "block"
-for.stack-blocks.gripper = 1.0
-""")
-    tasks = lw.load_tasks(tmp_path / "tasks.toml")
-    own = lw.load_plans(tmp_path / "stack-blocks.plan", tasks=tasks)["stack-blocks"]
+def stacking():
+    tasks = lw.load_tasks(STACKING / "tasks.toml")
+    own = lw.load_plans(STACKING / "stack-blocks.plan", tasks=tasks)["stack-blocks"]
     return tasks, {"stack-blocks": own, "push": lw.load_plans("MT10")["push"]}
 
 
@@ -351,17 +334,17 @@ def test_plans_queries_and_actors_of_a_51st_task(stacking):
         without(batch.clone())
 
 
-def test_scripted_skills_of_a_51st_task(stacking, tmp_path):
+def test_scripted_skills_of_a_51st_task(stacking):
     tasks, plans = stacking
     own = {"stack-blocks": plans["stack-blocks"]}
     batch = states(plans)[[0, 2]]
     batch["qaf"] = batch["qaf"][:, :2]
-    skills = lw.load_skills(tmp_path / "skills.toml", tasks=tasks)
+    skills = lw.load_skills(STACKING / "skills.toml", tasks=tasks)
     action = lw.ScriptedSkillActor(own, skills=skills)(batch)["action"]
     error = batch["observation"][0, 11:14] + torch.tensor([0.0, 0.0, 0.1]) - batch["observation"][0, 4:7]
     torch.testing.assert_close(action[0], torch.cat([(10 * error).clamp(-1, 1), torch.ones(1)]))
     with pytest.raises(SkillError, match="stack-blocks"):
-        lw.load_skills(tmp_path / "skills.toml")
+        lw.load_skills(STACKING / "skills.toml")
 
 
 def test_a_plan_without_a_definition_is_for_one_of_the_50():

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from cases import read_cases
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plan_texts import read_table
@@ -112,31 +113,7 @@ def test_no_value_raises_an_error(value):
     lw.decode_plan(json.dumps(value), "push")
 
 
-NEAR, OPEN = "the robot's gripper is near the puck", "the robot's gripper is open"
-NOT_NEAR, NOT_OPEN = (text.replace("is", "is not") for text in (NEAR, OPEN))
-CONDITIONS = [
-    ({"left": "gripper", "rel": "is near", "right": "puck"}, NEAR),
-    ({"a": "gripper", "op": "not near", "b": "puck"}, NOT_NEAR),
-    ({"a": "gripper", "op": "is not", "b": "open"}, NOT_OPEN),
-    ({"lhs": "gripper.state", "op": "!=", "rhs": "open"}, NOT_OPEN),
-    ({"lhs": "distance(gripper, puck)", "op": ">", "rhs": 0.05}, NOT_NEAR),
-    ({"metric": "distance", "from": "gripper", "to": "puck", "op": ">", "value": 0.05}, NOT_NEAR),
-    ({"distance_between": ["gripper", "puck"], "less_than": 0.05}, NEAR),
-    ({"not": {"near": ["gripper", "puck"]}}, NOT_NEAR),
-    ({"not_near": ["gripper", "puck"]}, NOT_NEAR),
-    ({"gripper": "not open"}, NOT_OPEN),
-    ({"predicate": "near", "args": ["gripper", "puck"], "expect": False}, NOT_NEAR),
-    ({"near": ["gripper", "puck"], "none": ["gripper open"]}, f"{NEAR} and {NOT_OPEN}"),
-    (
-        {"op": "and", "left": {"near": ["gripper", "puck"]}, "right": {"not": {"open": "gripper"}}},
-        f"{NEAR} and {NOT_OPEN}",
-    ),
-    ({"==": [{"var": "gripper.state"}, "open"]}, OPEN),
-    ("¬near(gripper, puck)", NOT_NEAR),
-]
-
-
-@pytest.mark.parametrize(("condition", "query"), CONDITIONS)
+@pytest.mark.parametrize(("condition", "query"), read_cases("language/values.toml")["conditions"])
 def test_conditions_in_parts_and_their_negations(condition, query):
     rules = {"rules": [{"when": condition, "do": "lift the puck"}, {"do": "wait"}]}
     assert str(lw.decode_plan(json.dumps(rules), "push").plan.steps[0].condition) == query
