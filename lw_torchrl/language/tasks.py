@@ -62,9 +62,7 @@ class Task:
                     raise ValueError(f"position of {named.name!r} must use obs[0] to obs[{size - 1}], got obs[{index}]")
         names = [named.name for named in self.objects]
         if names[:1] != [GRIPPER] or len({*names}) != len(names) or len(names) > _MOST_OBJECTS:
-            raise ValueError(
-                f"objects of {self.name!r} must be {GRIPPER!r} first, distinct, at most {_MOST_OBJECTS}, got {names}"
-            )
+            raise ValueError(f"objects of {self.name!r} must be 1 to 64 distinct names, {GRIPPER!r} first, got {names}")
 
     @cached_property
     def object_names(self) -> tuple[str, ...]:

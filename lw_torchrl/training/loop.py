@@ -334,9 +334,7 @@ class Training:
     def save(self) -> None:
         """Check that all weights are finite, then write the checkpoint files atomically if ``checkpoint`` is set."""
         if bad := [name for name, tensor in self.parameters().items() if not tensor.isfinite().all()]:
-            raise ValueError(
-                f"weights: {bad[0]} must be finite, is NaN after step {self.steps}; try a lower learning rate"
-            )
+            raise ValueError(f"weights: {bad[0]} is NaN or infinite after step {self.steps}; try a lower learning rate")
         if self._files is not None:
             part = self.saved if self.part else None
             self._files.write(self.description, self.device, self.contents(), self.state_dict(), part)
