@@ -21,14 +21,8 @@ from beartype.vale import Is, IsInstance
 _NOT_BOOL = ~IsInstance[bool]
 _MOST = float(np.finfo(float).max)
 # Reject bools as numbers, NaN, and integers that are too large for a float.
-_CONF = BeartypeConf(
-    hint_overrides=FrozenDict(
-        {
-            int: Annotated[Integral, _NOT_BOOL],
-            float: Annotated[Real, _NOT_BOOL & Is[lambda x: abs(x) <= _MOST or abs(x) == inf]],
-        }
-    )
-)
+_FLOAT = Annotated[Real, _NOT_BOOL & Is[lambda x: abs(x) <= _MOST or abs(x) == inf]]
+_CONF = BeartypeConf(hint_overrides=FrozenDict({int: Annotated[Integral, _NOT_BOOL], float: _FLOAT}))
 Count = Annotated[int, Is[lambda n: n >= 1]]
 Natural = Annotated[int, Is[lambda n: n >= 0]]
 Finite = Annotated[float, Is[lambda x: abs(x) <= _MOST]]
@@ -60,12 +54,8 @@ class ArgumentError(TypeError, ValueError):
 
 
 def typed(function: Function) -> Function:
-    """Decorate a function to check arguments against their annotations, and raise an :class:`ArgumentError` for the
-    first invalid argument; :func:`check_value` converts the others.
-
-    Annotations are evaluated at the first call. An argument whose type is imported only for type checkers is not
-    checked here (:func:`as_plans` checks ``plans``), nor are ``*args`` and ``**kwargs``.
-    """
+    """Decorate a function to pass each argument through :func:`check_value` with its annotation, except ``*args``,
+    ``**kwargs`` and arguments whose type is imported only for type checkers (:func:`as_plans` checks ``plans``)."""
 
     def read_hints() -> dict[str, Any]:
         hints: dict[str, Any] = {}
@@ -80,8 +70,7 @@ def typed(function: Function) -> Function:
 
 def typed_fields(kind: Class) -> Class:
     """Decorate a dataclass to check fields against their annotations on construction, as :func:`typed` does."""
-    init = _checked(kind.__init__, lambda: get_type_hints(kind, include_extras=True))  # type: ignore[misc]
-    kind.__init__ = init  # type: ignore[misc]
+    kind.__init__ = _checked(kind.__init__, lambda: get_type_hints(kind, include_extras=True))  # type: ignore[misc]
     return kind
 
 
@@ -89,7 +78,7 @@ def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
     code = function.__code__
     positional = code.co_varnames[: code.co_argcount]
     named = {*code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]}
-    hints: dict[str, Any] = {}
+    hints: dict[str, Any] = {}  # evaluated at the first call
 
     def check(name: str, value: Any) -> Any:
         return check_value(name, value, hints[name]) if name in hints else value

@@ -69,8 +69,7 @@ def finite(tensor: Tensor) -> bool:
 def check_finite(argument: str, tensor: Tensor) -> None:
     """Raise an error, as :func:`check_values` does, unless all elements of a tensor are finite."""
     if not (readable(tensor) and finite(tensor)):
-        problem = f"{argument} must hold finite numbers, got NaN or infinity"
-        check_values(lambda values: values.isfinite().all(), tensor, problem)
+        check_values(lambda x: x.isfinite().all(), tensor, f"{argument} must hold finite numbers, got NaN or infinity")
 
 
 CPU = torch.device("cpu")

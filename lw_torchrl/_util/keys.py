@@ -43,12 +43,6 @@ def as_keys(argument: str, value: Sequence[NestedKey] | None, default: Sequence[
     return keys
 
 
-def check_key(argument: str, value: Any) -> None:
-    """Raise a :class:`TypeError` unless ``value`` is a valid tensordict key."""
-    if isinstance(value, list) or _key(value) is None:
-        raise TypeError(f"{argument} must be a key (a string or a tuple of strings), got {value!r}")
-
-
 def check_apart(in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:
     """Raise a :class:`ValueError` if a module would overwrite its inputs."""
     if both := [key for key in out_keys if key in in_keys]:

@@ -7,7 +7,7 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from lw_torchrl._util.checks import unknown_name
+from lw_torchrl._util.checks import check_value, unknown_name
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -114,6 +114,5 @@ class Registry(UserDict[str, Entry]):
 
 def is_function(name: str, entry: Any) -> Callable[..., Any]:
     """Return ``entry`` if it is callable; otherwise raise a :class:`TypeError`."""
-    if not callable(entry):
-        raise TypeError(f"{name!r} must be a function, got {entry!r:.80}")
-    return entry
+    function: Callable[..., Any] = check_value(repr(name), entry, Callable)
+    return function

@@ -14,20 +14,20 @@ CAMERAS = ("corner2", "corner", "corner3", "corner4", "topview", "behindGripper"
 _LARGEST = 4096  # pixels along a side
 
 
-def check_picture(camera: str, height: int, width: int) -> None:
-    """Raise a :class:`ValueError` if the camera is unknown or the height or width is not from 1 to 4096 pixels."""
+def check_picture(camera: str, height: int, width: int, most: int = _LARGEST) -> None:
+    """Raise a :class:`ValueError` if the camera is unknown or the height or width is not from 1 to ``most`` pixels."""
     check_choice("camera", camera, CAMERAS)
-    if max(check_value("height", height, Count), check_value("width", width, Count)) > _LARGEST:
-        raise ValueError(f"height and width must be at most {_LARGEST} pixels, got {height} and {width}")
+    if max(check_value("height", height, Count), check_value("width", width, Count)) > most:
+        raise ValueError(f"height and width must be at most {most} pixels, got {height} and {width}")
 
 
-def check_cameras(cameras: str | Sequence[str], height: int, width: int) -> tuple[str, ...]:
+def check_cameras(cameras: str | Sequence[str], height: int, width: int, most: int = _LARGEST) -> tuple[str, ...]:
     """Return the camera names as a tuple; raise an error if it is empty or has an unknown or repeated name."""
     names = (cameras,) if isinstance(cameras, str) else tuple(cameras)
     if not names or len({*names}) < len(names):
         raise ValueError(f"cameras must be one or more distinct names, got {cameras!r}")
     for name in names:
-        check_picture(name, height, width)
+        check_picture(name, height, width, most)
     return names
 
 

@@ -128,12 +128,9 @@ def _check_scripted(plans: Plans, skills: Mapping[str, ScriptedSkill], sources: 
     """Raise a ValueError that names the steps of a plan that have no scripted skill, each with the task's nearest."""
     for task, plan in plans.items():
         own = skills_for(plan.definition, skills)
-        faults = []
-        for number, text in enumerate((step.skill for step in plan.steps), 1):
-            if text not in skills:
-                nearest = nearest_skill(text, plan.definition, own)[0].text
-                faults.append(f"step {number} {text!r} (nearest: {nearest!r})")
-        if faults:
+        texts = {number: step.skill for number, step in enumerate(plan.steps, 1) if step.skill not in skills}
+        near = {number: nearest_skill(text, plan.definition, own)[0].text for number, text in texts.items()}
+        if faults := [f"step {number} {texts[number]!r} (nearest: {near[number]!r})" for number in texts]:
             name = task.replace("/", "__")
             paths = [Path(source, part) for source in reversed(sources) for part in (f"{name}.plan", "")]
             files = sorted((path for path in paths if path.is_file()), key=lambda path: path.stem != name)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import Count, counted
+from lw_torchrl._util.checks import Count, check_value, counted
 from lw_torchrl._util.files import read_text
 from lw_torchrl._util.text import printable
 from lw_torchrl._util.workers import start_early
@@ -201,11 +201,8 @@ def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> 
     if Path(name).exists() or not (":" in name or name == "StateQueryEvaluator"):
         return lw.training.load_evaluator(name, plans, text_encoder=encoder)
     evaluator: Any = import_object("--evaluator", name) if ":" in name else lw.modules.StateQueryEvaluator
-    if isinstance(evaluator, lw.QueryEvaluator):
-        return evaluator.with_plans(plans)
-    if not (isinstance(evaluator, type) and issubclass(evaluator, lw.QueryEvaluator)):
-        raise ValueError(f"--evaluator {name} must be a lw.QueryEvaluator or a subclass, got {evaluator!r:.80}")
-    return evaluator(plans)
+    evaluator = check_value("--evaluator", evaluator, lw.QueryEvaluator | type[lw.QueryEvaluator])
+    return evaluator(plans) if isinstance(evaluator, type) else evaluator.with_plans(plans)
 
 
 def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite | None:
@@ -214,9 +211,7 @@ def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite |
 
     if name is None:
         return find_suite(tasks) if any("/" in task or suite_name(task) != "metaworld" for task in tasks) else None
-    suite = import_object("the suite", name) if ":" in name else load_suite(name)
-    if not isinstance(suite, Suite):
-        raise ValueError(f"--suite {name} must be a Suite, got {type(suite).__name__}")
+    suite: Suite = check_value("--suite", import_object("the suite", name) if ":" in name else load_suite(name), Suite)
     return suite
 
 

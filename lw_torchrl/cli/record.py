@@ -98,8 +98,6 @@ class View:
     def run(self) -> None:
         from lw_torchrl.record import open_viewer
 
-        if self.web and (self.screenshot is not None or self.step is not None):
-            raise ValueError("--web cannot be combined with --screenshot or --step")
         web_port = self.port if self.web else None
         tab: dict[str, Any] = {"episode": self.episode, "step": self.step}
         open_viewer(self.recordings, self.screenshot, self.window_size, web_port=web_port, **tab)

@@ -67,8 +67,13 @@ class Train:
     json: options.Json = False
 
     def run(self) -> Output:
-        self._check()  # before the imports, which take seconds
-        import torch
+        if self.logger in ("wandb", "tensorboard") and find_spec(self.logger) is None:
+            raise ImportError(f"--logger {self.logger} requires the package {self.logger}: pip install {self.logger}")
+        if self.begin is not None and self.out.resolve() == self.begin.resolve():
+            raise ValueError(f"--out must differ from --begin, got {str(self.out)!r} for both")
+        if self.loss != "bc" and (self.evaluator is not None or self.qaf_anchor):
+            raise ValueError("--evaluator and --qaf-anchor only apply to --loss bc")
+        import torch  # after the checks, because it takes seconds
 
         from lw_torchrl.data.dataset import read_metadata
         from lw_torchrl.training.offline import DISTRIBUTIONS
@@ -102,14 +107,6 @@ class Train:
         loss, steps = trainer.train(), trainer.config.steps
         output = Output(self.json).show("policy", self.out).show("steps", steps)
         return output.show("loss", loss, f"{_trained(steps, loss)}: {self.out}")
-
-    def _check(self) -> None:
-        if self.logger in ("wandb", "tensorboard") and find_spec(self.logger) is None:
-            raise ImportError(f"--logger {self.logger} requires the package {self.logger}: pip install {self.logger}")
-        if self.begin is not None and self.out.resolve() == self.begin.resolve():
-            raise ValueError(f"--out must differ from --begin, got {str(self.out)!r} for both")
-        if self.loss != "bc" and (self.evaluator is not None or self.qaf_anchor):
-            raise ValueError("--evaluator and --qaf-anchor only apply to --loss bc")
 
     @property
     def _numbers(self) -> dict[str, Any]:

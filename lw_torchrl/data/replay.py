@@ -82,12 +82,8 @@ class DatasetStorage(TensorStorage):
 
 
 def _check_transforms(sampler: Sampler, *transforms: Any) -> None:
-    """Raise ValueError for a transform that acts only when rows are written, or that would mix episodes, because it
-    reads consecutive time steps.
-
-    A SliceSampler returns consecutive rows in flat samples, which an earlier transform must reshape.
-    """
-    is_reshaped = False
+    """Raise ValueError for a transform that acts only when rows are written, or that would mix episodes."""
+    is_reshaped = False  # a SliceSampler returns consecutive rows in flat samples, which a transform must reshape
     for part in (part for transform in transforms if isinstance(transform, Transform) for part in transform.modules()):
         if instead := next((hint for kind, hint in _ON_WRITING.items() if isinstance(part, kind)), None):
             raise ValueError(f"transform: {type(part).__name__} does not change samples; use {instead} instead")

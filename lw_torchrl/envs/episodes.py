@@ -14,6 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
+from lw_torchrl._util.checks import check_value
 from lw_torchrl._util.devices import CPU, in_blocks, place
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.rows import action_noise
@@ -87,9 +88,7 @@ def run_episodes(
             policy.
         on_progress: called after each step with the number of new steps; the steps that an early end skips also count.
     """
-    base = env.base_env if isinstance(env, TransformedEnv) else env
-    if not isinstance(base, LanguageWorldEnv):
-        raise TypeError(f"env must be a LanguageWorldEnv, with or without transforms, got {type(base).__name__}")
+    base = check_value("env", env.base_env if isinstance(env, TransformedEnv) else env, LanguageWorldEnv)
     rows = len(base.row_tasks)
     waiting = {task: deque(enumerate(listed)) for task, listed in episodes.items()}
     if unknown := set(waiting) - set(base.tasks):

@@ -11,7 +11,6 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
 from lw_torchrl._util.checks import Count, Scale, typed
-from lw_torchrl._util.keys import check_key
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.attribution import attribute_failures
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
@@ -111,8 +110,6 @@ def evaluate(
         raise ValueError("attribute=True requires plans: pass plans, or an actor that has plans")
     if reference is not None and not attribute:
         raise ValueError("reference requires attribute=True, which re-runs failed episodes with the reference plans")
-    for key in also_record:
-        check_key("also_record", key)
     shared: dict[str, Any] = {"seed": seed, "max_steps": max_steps or own_suite.max_steps}
     env_options = shared | {"suite": own_suite, "engine": engine, "num_threads": num_threads}
     run: dict[str, Any] = {"noise_scale": noise_scale, "num_envs": num_envs, "device": device, "progress": progress}

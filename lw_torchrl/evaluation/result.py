@@ -122,28 +122,24 @@ class EvaluationResult:
             if "failures" in content:
                 failures = tuple(map(Failure.from_json, check_value("failures", content["failures"], list)))
             result = cls(config, episodes, check_value("origin", content.get("origin", {}), dict), failures)
-            result._check()
+            number, last = config["episodes_per_task"], config["max_steps"]
+            for episode in episodes:
+                first = episode.first_success
+                if episode.success == (first is None) or (first or 0) > last or (episode.success_at_end and not first):
+                    raise ValueError(f"episodes: success, first_success and success_at_end must agree, got {episode}")
+            counts = Counter(task for task, _ in {(episode.task, episode.episode) for episode in episodes})
+            if not tasks or counts != dict.fromkeys(tasks, number) or len(episodes) != number * len(tasks):
+                raise ValueError(f"episodes must hold {number} episodes of each task in config, got {dict(counts)}")
+            failed = sorted((e.task, e.episode, config["seed"]) for e in episodes if not e.success)
+            attributed = failed if failures is None else sorted((f.task, f.episode, f.seed) for f in failures)
+            if failed != attributed or any(failure.at >= last for failure in failures or ()):
+                raise ValueError(f"failures must hold a Failure of each failed episode, with its seed, at t < {last}")
             if set(content["success_once"]) != {*tasks}:
                 raise ValueError("success_once and config must have the same tasks")
             return result
         except (ValueError, KeyError, TypeError) as error:
             name = f"{str(path)!r} is not a result of {FORMAT} version {FORMAT_VERSION}"
             raise ValueError(f"path: {name} ({type(error).__name__}: {str(error)[:500]})") from error
-
-    def _check(self) -> None:
-        """Raise :class:`ValueError` unless config, episodes and failures agree."""
-        tasks, number, last = (self.config[name] for name in ("tasks", "episodes_per_task", "max_steps"))
-        for episode in self.episodes:
-            first = episode.first_success
-            if episode.success == (first is None) or (first or 0) > last or (episode.success_at_end and not first):
-                raise ValueError(f"episodes: success, first_success and success_at_end must agree, got {episode}")
-        counts = Counter(task for task, _ in {(episode.task, episode.episode) for episode in self.episodes})
-        if not tasks or counts != dict.fromkeys(tasks, number) or len(self.episodes) != number * len(tasks):
-            raise ValueError(f"episodes must hold {number} episodes of each task in config, got {dict(counts)}")
-        failed = sorted((e.task, e.episode, self.config["seed"]) for e in self.episodes if not e.success)
-        failures = failed if self.failures is None else sorted((f.task, f.episode, f.seed) for f in self.failures)
-        if failed != failures or any(failure.at >= last for failure in self.failures or ()):
-            raise ValueError(f"failures must hold a Failure, with the same seed, of each failed episode, at t < {last}")
 
     def table(self) -> str:
         """Return a text table of each task's success rates and mean first successful time step."""

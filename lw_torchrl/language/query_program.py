@@ -135,12 +135,9 @@ class QueryProgram(nn.Module):
         if ids != shape[:-1] or task_id.dtype not in (torch.int64, torch.int32):
             raise ValueError(f"task_id must be int64 of shape {shape[:-1]}, got {task_id.dtype} of shape {ids}")
         needed = (*ids, self.num_latches)
-        if latches is None and self.num_latches:
-            raise ValueError(
-                f"the queries depend on earlier steps of the episode: pass latches, bool of shape {needed}"
-            )
-        if latches is not None and self.num_latches and (latches.shape != needed or latches.dtype != torch.bool):
-            raise ValueError(f"latches must be bool of shape {needed}, got {latches.dtype} of {tuple(latches.shape)}")
+        got = None if latches is None else (latches.dtype, tuple(latches.shape))
+        if self.num_latches and got != (torch.bool, needed):
+            raise ValueError(f"latches must be bool of shape {needed}, for queries on earlier steps, got {got}")
         if (kernel := self._kernel(observation, task_id, latches)) is not None:
             return self._answer(kernel, observation, task_id, latches)
         check_finite("observation", observation)

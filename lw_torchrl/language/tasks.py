@@ -55,16 +55,14 @@ class Task:
 
     def __post_init__(self) -> None:
         _check_name(self.name)
-        what, size = f"objects of task {self.name!r}", self.layout.size
+        size = self.layout.size
         for named in self.objects:
             for index in (*named.position, named.opening):
                 if isinstance(index, int) and not 0 <= index < size:
                     raise ValueError(f"position of {named.name!r} must use obs[0] to obs[{size - 1}], got obs[{index}]")
         names = [named.name for named in self.objects]
         if names[:1] != [GRIPPER] or len({*names}) != len(names) or len(names) > _MOST_OBJECTS:
-            raise ValueError(
-                f"{what} must be {GRIPPER!r} first and at most {_MOST_OBJECTS} distinct names, got {names}"
-            )
+            raise ValueError(f"objects of {self.name!r} must be 1 to 64 distinct names, {GRIPPER!r} first, got {names}")
 
     @cached_property
     def object_names(self) -> tuple[str, ...]:
@@ -199,11 +197,9 @@ _SETS = {"MT10": MT10, "MT50": MT50}
 _RANK = {name: rank for rank, name in enumerate(MT50)}
 
 
-def check_task(name: object, tasks: Tasks = TASKS) -> str:
+def check_task(name: Any, tasks: Tasks = TASKS) -> str:
     """Return ``name`` if ``tasks`` has this task; else raise a ValueError that suggests the nearest name."""
-    if not isinstance(name, str):
-        raise TypeError(f"task must be the name of a task, got {shown(name)} ({type(name).__name__})")
-    if name not in tasks:
+    if check_value("task", name, str) not in tasks:
         raise _unknown_task("task", name, tasks)
     return name
 
@@ -292,11 +288,9 @@ def lists_by_task(argument: str, lists: Mapping[str | Task, Any]) -> dict[Task, 
     check_value(argument, lists, Mapping)
     tasks = (name if isinstance(name, Task) else TASKS[check_choice(argument, name, TASKS)] for name in lists)
     by_task = dict(zip(tasks, lists.values(), strict=True))
-    if not by_task or len({task.name for task in by_task}) < len(lists):
-        raise ValueError(f"{argument} must contain at least one task, and each task once, got {shown(lists)}")
-    for task, listed in by_task.items():
-        if not isinstance(listed, list | tuple) or not listed:
-            raise ValueError(f"{argument}[{task.name!r}] must be a list of at least one item, got {shown(listed)}")
+    is_full = bool(by_task) and all(isinstance(listed, list | tuple) and listed for listed in by_task.values())
+    if not is_full or len({task.name for task in by_task}) < len(lists):
+        raise ValueError(f"{argument} must map tasks, each once, to lists of at least one item, got {shown(lists)}")
     return by_task
 
 

@@ -91,9 +91,7 @@ def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
 
     vectors = (encoder or encode_texts)(texts)
     if not isinstance(vectors, torch.Tensor) or not vectors.is_floating_point() or vectors.shape[:-1] != (len(texts),):
-        raise ArgumentError(
-            f"text_encoder must return a tensor of floats of shape ({len(texts)}, E), got {vectors!r:.80}"
-        )
+        raise ArgumentError(f"text_encoder must return floats of shape ({len(texts)}, E), got {vectors!r:.80}")
     if not vectors.isfinite().all():
         wrong = texts[int((~vectors.isfinite()).any(-1).nonzero()[0])]
         raise ValueError(f"text_encoder must return finite numbers, got NaN or infinity for {wrong!r}")

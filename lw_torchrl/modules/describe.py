@@ -75,9 +75,7 @@ def _encode_module(module: nn.Module, plans: list[Plans], path: str) -> dict[str
     else:
         options = getattr(module, "config", None)
         if not isinstance(options, Mapping):
-            raise TypeError(
-                f"{where} is a {kind.__qualname__}, which cannot be saved: add config, the constructor's arguments"
-            )
+            raise TypeError(f"{where} cannot be saved: add config, the arguments of {kind.__qualname__}(...)")
         if "plans" not in options and "plans" in signature(getattr(kind, "rebuild", kind)).parameters:
             options = {"plans": module.plans, **options}
         name = kind.__name__ if kind.__module__.startswith("lw_torchrl.") else f"{kind.__module__}:{kind.__qualname__}"

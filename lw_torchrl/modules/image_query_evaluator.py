@@ -155,13 +155,10 @@ class ImageQueryEvaluator(ClauseEvaluator):
         if names is None:
             names = sorted({name for plan in plans.values() for name in plan.definition.object_names})
         super().__init__(plans, answers=answers, predicates=predicates, names=names)
-        self.cameras = check_cameras(cameras, height, width)
-        if max(height, width) > _LARGEST:
-            raise ValueError(f"height and width must be at most {_LARGEST} pixels, got {height} and {width}")
+        self.cameras = check_cameras(cameras, height, width, _LARGEST)
         self.height, self.width, self.every = height, width, every
         self.in_keys = ["pixels", "task_id"]
-        check_choice("encoder", encoder, IMAGE_ENCODERS)
-        image_encoder = IMAGE_ENCODERS[encoder]()
+        image_encoder = IMAGE_ENCODERS[check_choice("encoder", encoder, IMAGE_ENCODERS)]()
         with torch.no_grad():
             _, features, _, _ = image_encoder(torch.zeros(1, 3, height, width, dtype=torch.float32)).shape
         sizes = {"cameras": len(self.cameras), "names": len(self.names), "predicates": len(self.predicates)}
@@ -176,5 +173,4 @@ class ImageQueryEvaluator(ClauseEvaluator):
     def check_seen(self, seen: Tensor) -> None:
         shape = (self.height, self.width * len(self.cameras), 3)
         if seen.shape[-3:] != shape or seen.dtype != torch.uint8:
-            got = f"{seen.dtype} of shape {tuple(seen.shape)}; evaluator.transform() writes them"
-            raise ValueError(f"pixels must be uint8 of shape (..., {', '.join(map(str, shape))}), got {got}")
+            raise ValueError(f"pixels must be uint8 (..., {str(shape)[1:-1]}), got {seen.dtype} {tuple(seen.shape)}")

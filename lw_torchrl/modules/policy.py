@@ -57,8 +57,7 @@ def make_policy(method: str, plans: AnyPlans, **options: Any) -> TensorDictModul
         >>> lw.modules.make_policy("dc", lw.load_plans("MT10")).tasks == lw.MT10
         True
     """
-    check_choice("method", method, METHODS)
-    return METHODS[method](as_plans(plans), **options)
+    return METHODS[check_choice("method", method, METHODS)](as_plans(plans), **options)
 
 
 def _parts(actor: Any) -> Iterator[Any]:

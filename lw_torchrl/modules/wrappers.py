@@ -86,9 +86,7 @@ class ActorEnsemble(_Wrapper):
     def __init__(self, members: Sequence[TensorDictModuleBase]) -> None:
         super().__init__()
         if len({(_fingerprint(member), tasks_of(member)) for member in members}) != 1:
-            raise ValueError(
-                f"members must be one or more actors with equal plans and tasks, got {len(members)} actors"
-            )
+            raise ValueError(f"members must be one or more actors with equal plans and tasks, got {len(members)}")
         self.members: Any = nn.ModuleList(members)
         written = [key for key in members[0].out_keys if last_name(key) in ("action", "skill_weights")]
         self._written: list[NestedKey] = sorted(written, key=last_name)

@@ -12,10 +12,9 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_choice, check_value, counted, shown, typed
+from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_value, counted, shown, typed
 from lw_torchrl._util.files import AnyPath, expanded, read_json, write_json
 from lw_torchrl._util.progress import Progress
-from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import TASKS, Task, TaskList, Tasks, get_task, named_tasks
@@ -154,7 +153,6 @@ class OpenAIPlanner:
             ImportError: a request needs the extra ``[llm]``, which is not installed.
             ValueError: a task has no scripted skill, or the folder has answers with different settings.
         """
-        check_choice("format", format, PLAN_FORMATS)
         count = check_value("attempts", attempts, Count)
         each = [(task, attempt) for task in named_tasks(tasks).values() for attempt in range(count)]
         questions = [Question(task, attempt, self.request(task, format, attempt)) for task, attempt in each]

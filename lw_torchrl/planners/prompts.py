@@ -25,7 +25,6 @@ _ALWAYS = "pick-place"  # always an example, since many tasks need its skills
 _EXAMPLES = 3
 
 
-@typed
 def prompt_examples(task: str | Task, plans: AnyPlans | None = None) -> tuple[ConditionalPlan, ...]:
     """Return the example plans for a prompt: the pick-place plan, and those for tasks with similar descriptions.
 
@@ -83,14 +82,14 @@ def plan_prompt(
         # drawer-open: Take hold of the drawer handle and pull the drawer open.
     """
     task = get_task(task, tasks)
-    check_choice("format", format, PLAN_FORMATS)
+    prompt = PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].prompt
     hints = (
         f"The things in {task.name} are: {', '.join(f'the {name}' for name in task.object_names)}.",
         f"A condition says that one of them is, or is not, {', '.join(RELATIONS)} another one, or touching the table;",
         f"or that the {' or '.join(task.openings)} is {' or '.join(STATES)}. "
         "Several conditions are joined by 'and'; there is no 'or'.",
     )
-    return PLAN_FORMATS[format].prompt(prompt_examples(task, plans), task, hints if vocabulary else ())
+    return prompt(prompt_examples(task, plans), task, hints if vocabulary else ())
 
 
 class Question(NamedTuple):

@@ -69,8 +69,7 @@ def check_image(name: str, image: Any) -> NDArray[np.uint8]:
     if pixels.is_floating_point() and bool(((pixels >= 0) & (pixels <= 1)).all()):
         pixels = (pixels * 255).round().to(torch.uint8)
     if pixels.ndim != 3 or pixels.shape[-1] not in (1, 3) or not pixels.numel() or pixels.dtype != torch.uint8:
-        allowed = "uint8 or float in [0, 1] of shape H×W, H×W×C or C×H×W (C = 1 or 3)"
-        raise ValueError(f"image {name!r} must be {allowed}, got {pixels.dtype} of shape {shape}")
+        raise ValueError(f"image {name!r} must be H×W, H×W×C or C×H×W, uint8 or in [0, 1], got {pixels.dtype} {shape}")
     return pixels.contiguous().numpy()
 
 

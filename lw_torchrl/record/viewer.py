@@ -77,7 +77,7 @@ def open_viewer(
     if screenshot is not None and Path(screenshot).suffix != ".png":
         raise ValueError(f"screenshot must end in '.png', got {str(screenshot)!r}")
     if web_port is not None and (screenshot is not None or step is not None):
-        raise ValueError("web_port cannot be combined with screenshot or step")
+        raise ValueError("web_port (--web) cannot be combined with screenshot or step")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         files: list[Path] = []

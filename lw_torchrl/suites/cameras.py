@@ -63,9 +63,7 @@ class Cameras:
 
     def __init__(self) -> None:
         if _processes - {os.getpid()}:
-            raise RuntimeError(
-                "this process was forked after rendering, which breaks OpenGL: use mp_start_method='spawn'"
-            )
+            raise RuntimeError("OpenGL does not survive the fork of this process: use mp_start_method='spawn'")
         try:
             self._gl = _open_gl()
         except Exception as error:  # the type depends on the platform

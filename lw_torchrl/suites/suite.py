@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from lw_torchrl._util.checks import check_choice, shown, typed_fields, unknown_name
+from lw_torchrl._util.checks import check_choice, check_value, typed_fields, unknown_name
 from lw_torchrl._util.registry import ReadOnlyDict, Registry
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import Plans
@@ -58,9 +58,7 @@ class Suite:
                 wanted = f"names '{prefix}...' to tasks with the layout {self.layout.name!r}"
                 raise ValueError(f"tasks must map {wanted}, got {name!r}: {task.name!r} with {task.layout.name!r}")
         if self.plans is not None and (other := set(self.plans) - set(self.tasks)):
-            raise ValueError(
-                f"plans of suite {self.name!r} must be for its tasks, got plans for {', '.join(sorted(other))}"
-            )
+            raise ValueError(f"plans of suite {self.name!r} must be for its tasks, got {', '.join(sorted(other))}")
         if not isinstance(self.tasks, ReadOnlyDict):
             object.__setattr__(self, "tasks", ReadOnlyDict(dict(sorted(self.tasks.items()))))
 
@@ -82,9 +80,7 @@ class Suite:
 
 
 def _as_suite(name: str, entry: Any) -> Suite:
-    suite = entry() if callable(entry) else entry
-    if not isinstance(suite, Suite):
-        raise TypeError(f"suite {name!r} must be a Suite or a function that returns a Suite, got {shown(entry)}")
+    suite: Suite = check_value(f"suite {name!r}", entry() if callable(entry) else entry, Suite)
     return suite
 
 

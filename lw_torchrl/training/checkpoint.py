@@ -186,16 +186,10 @@ def _copy_tensors(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> N
         if (stored[name].dtype, stored[name].shape) != (tensor.dtype, tensor.shape):
             got = f"{stored[name].dtype} of shape {tuple(stored[name].shape)}"
             raise ValueError(f"{name} must be {tensor.dtype} of shape {tuple(tensor.shape)}, got {got}")
-    check_finite({name: stored[name] for name, tensor in weights.items() if isinstance(tensor, nn.Parameter)})
+        if isinstance(tensor, nn.Parameter) and not stored[name].isfinite().all():
+            raise ValueError(f"weights: {name} must be finite, but holds NaN or infinity")
     for name, tensor in weights.items():
         tensor.copy_(stored[name])
-
-
-def check_finite(weights: Mapping[str, Tensor]) -> None:
-    """Raise :class:`ValueError` if a weight is NaN or infinite."""
-    for name, tensor in weights.items():
-        if not tensor.isfinite().all():
-            raise ValueError(f"weights: {name} must be finite, but holds NaN or infinity")
 
 
 def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
@@ -242,8 +236,7 @@ def training_file(checkpoint: Path) -> Path:
 
 
 def check_description(path: Path, expected: Mapping[str, Any], stored: Mapping[str, Any] | None = None) -> None:
-    """Raise :class:`ValueError` unless the description of the policy file ``path``, or ``stored``, has the entries
-    ``expected``."""
+    """Raise :class:`ValueError` unless the description in the policy file ``path`` has the entries ``expected``."""
     stored = read_description(path) if stored is None else stored
     for part, now in json.loads(json.dumps(expected)).items():  # as JSON, which has no tuples
         if (before := stored.get(part)) != now:

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import typed
+from lw_torchrl._util.checks import check_value, typed
 from lw_torchrl._util.devices import place
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
@@ -235,8 +235,7 @@ class QueryEvaluatorTrainer(Training):
             raise ValueError("data must hold states and queries to train on, but all are held out")
         queries: _StateQueries | _PictureQueries
         if isinstance(evaluator, ImageQueryEvaluator):
-            if not isinstance(config, ImageQueryEvaluatorConfig):
-                raise TypeError(f"config must be an ImageQueryEvaluatorConfig, got {type(config).__name__}")
+            check_value("config", config, ImageQueryEvaluatorConfig)
             queries = _PictureQueries(evaluator, tasks)
         else:
             queries = _StateQueries(evaluator, tasks)

@@ -13,7 +13,6 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
 from lw_torchrl._util.checks import Count, Natural, Probability, Scale, check_choice, typed, typed_fields
-from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.queries import Clause, Query, base_clauses
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.relations import PREDICATES
@@ -133,7 +132,11 @@ class LabelledQueries:
         if other := sorted({*ids.unique().tolist()} - {*known}):
             raise ValueError(f"tasks must include all tasks of the rows, but the task ids {other[:8]} are missing")
         present = [known[number] for number in ids.unique().tolist()]
-        _check_pictures(rows, present[0].layout)
+        if (pixels := rows.get("pixels", None)) is not None:  # check that all show the current state
+            hand, episode = (rows.get(key) for key in ("observation", ("collector", "traj_ids")))
+            moved = hand[:, present[0].layout.positions[0]].diff(dim=0).norm(dim=-1) > _MOVED
+            if any(torch.equal(pixels[row], pixels[row + 1]) for row in (moved & (episode.diff() == 0)).nonzero()):
+                raise ValueError("every must be the time steps between pictures: two are equal although the hand moved")
         generator = torch.Generator().manual_seed(config.seed)
         self.held_out_tasks = _draw_tasks(config.held_out_tasks, [task.name for task in present], generator)
         trained = [task for task in present if task.name not in self.held_out_tasks]
@@ -184,17 +187,6 @@ def _at_most(number: int, rows: Tensor, generator: torch.Generator) -> Tensor:
     if len(rows) <= number:
         return rows
     return rows[torch.randperm(len(rows), generator=generator)[:number].sort().values]
-
-
-def _check_pictures(rows: TensorDictBase, layout: Layout) -> None:
-    """Raise ValueError if consecutive pictures are equal although the hand moved: one then shows an earlier state."""
-    pixels, hand = rows.get("pixels", None), rows.get("observation")[:, layout.positions[0]]
-    if pixels is None:
-        return
-    moved, episode = hand.diff(dim=0).norm(dim=-1) > _MOVED, rows.get(("collector", "traj_ids"))
-    places = (moved & (episode.diff() == 0)).nonzero().flatten().tolist()
-    if any(torch.equal(pixels[row], pixels[row + 1]) for row in places):
-        raise ValueError("every must be the time steps between pictures: two are equal although the hand moved")
 
 
 def _draw_tasks(held_out: int | tuple[str, ...], names: Sequence[str], generator: torch.Generator) -> tuple[str, ...]:

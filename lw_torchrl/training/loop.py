@@ -21,7 +21,7 @@ from lw_torchrl._util.devices import CPU
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.training.captured import CapturedFunction, captures, foreign_code
-from lw_torchrl.training.checkpoint import CheckpointFiles, check_finite, contents_of
+from lw_torchrl.training.checkpoint import CheckpointFiles, contents_of
 from lw_torchrl.training.minibatches import Minibatches
 from lw_torchrl.training.normalization import share_contacts
 
@@ -333,10 +333,8 @@ class Training:
 
     def save(self) -> None:
         """Check that all weights are finite, then write the checkpoint files atomically if ``checkpoint`` is set."""
-        try:
-            check_finite(self.parameters())
-        except ValueError as error:
-            raise ValueError(f"{error} after step {self.steps}; try a lower learning rate") from error
+        if bad := [name for name, tensor in self.parameters().items() if not tensor.isfinite().all()]:
+            raise ValueError(f"weights: {bad[0]} is NaN or infinite after step {self.steps}; try a lower learning rate")
         if self._files is not None:
             part = self.saved if self.part else None
             self._files.write(self.description, self.device, self.contents(), self.state_dict(), part)

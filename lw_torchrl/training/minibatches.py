@@ -133,8 +133,7 @@ def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, s
     if isinstance(replay.sampler, PrioritizedSampler):
         raise ValueError("replay must not use a PrioritizedSampler, because the trainers do not update priorities")
     if not _draws_on_cpu(replay) and device_of_rows(replay.storage) != CPU:
-        where = f"{type(replay.sampler).__name__} draws on the GPU with a generator that is not saved"
-        raise ValueError(f"replay: its {where}; use a TaskBalancedSampler, or keep the rows on the CPU")
+        raise ValueError("replay: draws on the GPU cannot be resumed; use a TaskBalancedSampler, or rows on the CPU")
 
 
 def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:

@@ -171,10 +171,7 @@ class QAFTransform(KeepsEnvState):
         observation, task = self.in_keys
         (_, task_id), before = read(tensordict, self.in_keys), None
         if self.program.num_latches and (before := tensordict.get(self.out_keys[2], None)) is None:
-            raise ValueError(
-                f"rows have no {self.out_keys[2]!r}, but conditions depend on earlier steps; use rows of a rollout "
-                "with this QAFTransform, or LanguageWorldExperienceReplay(transform=QAFTransform(plans))"
-            )
+            raise ValueError(f"rows lack {self.out_keys[2]!r}: use LanguageWorldExperienceReplay with this transform")
         self._write(tensordict, task_id, before)
         following = tensordict.get("next", None)
         if following is not None and following.get(observation, None) is not None:

@@ -175,7 +175,7 @@ def test_a_position_outside_the_observation_is_refused(position):
 
 @pytest.mark.parametrize("names", [[], ["puck"], ["puck", GRIPPER], [GRIPPER, "puck", "puck"], [GRIPPER, GRIPPER]])
 def test_a_task_has_the_gripper_first_and_different_names(names):
-    with pytest.raises(ValueError, match="objects of task 'mine'"):
+    with pytest.raises(ValueError, match="objects of 'mine'"):
         Task("mine", "Mine.", tuple(NamedObject(name, (4, 5, 6)) for name in names))
 
 
@@ -184,7 +184,7 @@ def test_a_task_has_at_most_64_objects():
     task = Task.from_json("mine", {"description": "Mine.", "objects": objects})
     assert len(task.object_names) == 64
     assert str(nearest_query("cup 61 is abof cup 2", task).parts[0].query) == "the cup 61 is above the cup 2"
-    with pytest.raises(TaskError, match=r"objects of task 'mine' .*64"):
+    with pytest.raises(TaskError, match=r"objects of 'mine' .*64"):
         Task.from_json("mine", {"description": "Mine.", "objects": objects | {"lid": "obs[4:7]"}})
 
 

@@ -201,12 +201,12 @@ def test_a_dataset_recomputes_the_latches_of_the_environment(tmp_path, options, 
 def test_what_has_no_history_is_refused(few_latches):
     program = lw.QAFTransform(few_latches).program
     observation, ids = torch.zeros(2, 39), torch.tensor(IDS[:2])
-    with pytest.raises(ValueError, match=r"earlier steps.*pass latches, bool of shape \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"latches must be bool of shape \(2, 2\), .*earlier steps"):
         program(observation, ids)
     with pytest.raises(ValueError, match="latches must be bool of shape"):
         program(observation, ids, torch.zeros(2, 3))
     rows = TensorDict(observation=observation, task_id=ids, batch_size=[2])
-    with pytest.raises(ValueError, match=r"rows have no 'qaf_latches'.*LanguageWorldExperienceReplay"):
+    with pytest.raises(ValueError, match=r"rows lack 'qaf_latches'.*LanguageWorldExperienceReplay"):
         lw.QAFTransform(few_latches)(rows)
     with pytest.raises(ValueError, match=r"learned evaluator.*push depend on earlier steps"):
         lw.modules.StateQueryEvaluator(few_latches)

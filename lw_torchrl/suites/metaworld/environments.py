@@ -38,8 +38,7 @@ def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
     import_metaworld()
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 
-    check_task(task)
-    env = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-v3-goal-observable"](seed=0)
+    env = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{check_task(task)}-v3-goal-observable"](seed=0)
     env._freeze_rand_vec = False
     env.seeded_rand_vec = True
     env.max_path_length = max_steps

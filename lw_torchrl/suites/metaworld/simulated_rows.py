@@ -302,9 +302,7 @@ class ThreadedEngine(SeenRows):
     def step(self, action: NDArray[Any], active: Mask) -> EngineStep:
         n, size = len(self._started), self._layout.action_size
         if action.shape != (n, size) or active.shape != (n,):
-            raise ValueError(
-                f"action must have shape {(n, size)} and active {(n,)}, got {action.shape}, {active.shape}"
-            )
+            raise ValueError(f"action must be {(n, size)} and active {(n,)}, got {action.shape} and {active.shape}")
         if (waiting := np.flatnonzero(active & ~self._started)).size:
             raise RuntimeError(f"row {waiting[0]} must be reset before the first step, and after an interrupted step")
         # NaN must not reach the physics: MuJoCo would silently restart the row.
