@@ -41,8 +41,7 @@ def test_every_answer_is_compared(answers):
     rates = lw.evaluate(actor, tasks=["reach", "drawer-open"], **options).success_once
     assert comparison.rates("good", "basic_md") == {task: [rate] for task, rate in rates.items()}
     assert comparison.rates("good", "chain_py") == {task: [rate, 0.0] for task, rate in rates.items()}
-    assert comparison.mean("other", "chain_py") == 0.0
-    assert comparison.best_format("good") == "basic_md"
+    assert (comparison.mean("other", "chain_py"), comparison.best_format("good")) == (0.0, "basic_md")
     assert "| good  | chain_py | 2     | 4       | 2 " in comparison.table()
     reason = "the text has no steps for the task or any other task"
     assert no_plans(comparison) == ["answers without a plan: 4", f"4: {reason}"]
@@ -64,9 +63,6 @@ def test_command_writes_a_report_and_the_best_plans(tmp_path, capsys):
     assert (tmp_path / "out/formats.png").is_file()
     assert not (tmp_path / "out/models.png").exists(), "the models have no task in common"
     assert "answers without a plan: 1" in capsys.readouterr().out
-
-
-# ---- many plans in one simulation, and plans that read no text
 
 
 LONGER = {"episodes": 3, "seed": 1_000, "max_steps": 60, "progress": False}
@@ -93,8 +89,7 @@ def test_random_choices_depend_neither_on_rows_nor_on_other_plans():
     successes = evaluate_plans(MANY, num_envs=256, **LONGER)
     expected = [*successes[::-1], successes[0]]
     assert evaluate_plans([*MANY[::-1], MANY[0]], num_envs=6, on_plan=reported.__setitem__, **LONGER) == expected
-    assert reported == dict(enumerate(expected))
-    assert evaluate_plans(MANY[1:2], **LONGER) == successes[1:2]
+    assert (reported, evaluate_plans(MANY[1:2], **LONGER)) == (dict(enumerate(expected)), successes[1:2])
 
 
 def test_chooser_picks_motions_from_geometry():

@@ -1,5 +1,4 @@
-"""Statistics over seeds × tasks, and summaries of results: against scipy, by hand, and intervals that contain the truth
-as often as they claim."""
+"""Statistics over seeds × tasks, and summaries: against scipy, by hand, and how often intervals contain the truth."""
 
 import json
 
@@ -11,18 +10,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import mannwhitneyu, t, trim_mean, ttest_ind
 
 import lw_torchrl as lw
-from benchmarks.statistics import (
-    Estimate,
-    TaskSummary,
-    count_solved,
-    interquartile_mean,
-    mean_difference,
-    mean_over_tasks,
-    mean_rate,
-    probability_of_improvement,
-    summarize,
-    summarize_rates,
-)
+from benchmarks import statistics as over
+from benchmarks.statistics import Estimate, TaskSummary, mean_difference, mean_rate, probability_of_improvement
 from lw_torchrl.evaluation import EpisodeResult
 
 TWO = [mean_difference, probability_of_improvement]
@@ -42,7 +31,7 @@ def pairs(draw):
 
 @given(rates())
 def test_interquartile_mean_is_scipys(x):
-    assert interquartile_mean(x).value == pytest.approx(trim_mean(x, 0.25, axis=None))
+    assert over.interquartile_mean(x).value == pytest.approx(trim_mean(x, 0.25, axis=None))
 
 
 @settings(deadline=None)  # scipy's first call is slow
@@ -104,35 +93,30 @@ def test_interval_over_tasks_contains_the_mean_over_all_tasks(seeds):
         tasks, offsets = rng.normal(0.1, 0.2, 20), spread * rng.normal(size=(seeds, 1))
         return [tasks + offsets + rng.normal(0.0, 0.1, (seeds, 20))]
 
-    assert coverage(lambda x: mean_over_tasks(x, draws=1000), 0.1, draw) == pytest.approx(0.94, abs=0.03)
+    assert coverage(lambda x: over.mean_over_tasks(x, draws=1000), 0.1, draw) == pytest.approx(0.94, abs=0.03)
 
 
 def test_interval_over_tasks_of_equal_values_is_that_value():
-    estimate = mean_over_tasks(np.full((3, 4), 0.25))
+    estimate = over.mean_over_tasks(np.full((3, 4), 0.25))
     assert (estimate.value, estimate.low, estimate.high) == pytest.approx((0.25, 0.25, 0.25))
 
 
 def test_interval_of_the_probability_of_improvement_contains_the_truth():
     """X is uniform on [0.2, 1], Y on [0, 0.8]: Y is above X with probability 0.75² / 2."""
     draw = lambda rng: [0.2 + 0.8 * rng.random((5, 5)), 0.8 * rng.random((5, 5))]  # noqa: E731
-    share = coverage(probability_of_improvement, 1 - 0.75**2 / 2, draw, repeats=300)
-    assert share == pytest.approx(0.95, abs=0.04)
+    assert coverage(probability_of_improvement, 1 - 0.75**2 / 2, draw, repeats=300) == pytest.approx(0.95, abs=0.04)
 
 
 def test_tasks_solved_are_counted_at_the_threshold():
-    assert count_solved([[0.8, 0.79, 1.0], [0.8, 0.8, 0.6]]) == 2
-    assert count_solved([[0.75], [0.85], [0.8]]) == 1  # their float mean is below 0.8
-    assert count_solved([[0.5, 0.4]], threshold=0.5) == 1
+    assert over.count_solved([[0.8, 0.79, 1.0], [0.8, 0.8, 0.6]]) == 2
+    assert over.count_solved([[0.75], [0.85], [0.8]]) == 1  # their float mean is below 0.8
+    assert over.count_solved([[0.5, 0.4]], threshold=0.5) == 1
 
 
 def test_estimate_is_text_and_json():
     assert str(mean_rate([[0.762], [0.767], [0.790]])) == "0.773 [0.736, 0.810]"
-    assert str(Estimate(0.5, 0.4, 0.6)) == "0.500 [0.400, 0.600]"
-    assert str(mean_rate([[0.5, 1.0]])) == "0.750"
+    assert (str(Estimate(0.5, 0.4, 0.6)), str(mean_rate([[0.5, 1.0]]))) == ("0.500 [0.400, 0.600]", "0.750")
     assert json.loads(json.dumps(mean_rate([[0.5, 1.0]]).to_json())) == {"value": 0.75, "low": None, "high": None}
-
-
-# ---- summaries
 
 
 def make_result(hits, trials=4):
@@ -146,14 +130,11 @@ RESULTS = {3: make_result({"push": 2, "reach": 4, "sweep": 0}), 7: make_result({
 
 
 def test_numbers_are_those_computed_by_hand():
-    summary = summarize(RESULTS)
-    assert summary.mean.value == pytest.approx(0.5)
-    assert summary.solved == 1
+    summary = over.summarize(RESULTS)
+    assert (summary.mean.value, summary.solved) == (pytest.approx(0.5), 1)
     assert summary.per_task["push"] == TaskSummary(mean=0.625, min=0.5, max=0.75)
-    assert summary.by_seed == {"3": 0.5, "7": 0.5}
-    assert summary.array.tolist() == [[0.5, 1.0, 0.0], [0.75, 0.75, 0.0]]
-    assert summary.iqm == interquartile_mean(summary.array)
-    assert summary.mean == mean_rate(summary.array)
+    assert (summary.by_seed, summary.array.tolist()) == ({"3": 0.5, "7": 0.5}, [[0.5, 1.0, 0.0], [0.75, 0.75, 0.0]])
+    assert (summary.iqm, summary.mean) == (over.interquartile_mean(summary.array), mean_rate(summary.array))
 
 
 def rates_by_task(seeds):
@@ -165,8 +146,7 @@ def rates_by_task(seeds):
 @given(st.integers(1, 4).flatmap(rates_by_task))
 @example({"0": [0.0, 1e-151]})
 def test_summary_is_json_and_consistent(rates):
-    summary = summarize_rates(rates)
-    document = json.loads(json.dumps(summary.to_json(), allow_nan=False))
+    document = json.loads(json.dumps(over.summarize_rates(rates).to_json(), allow_nan=False))
     rows = document["tasks"].values()
     assert {task: row["rates"] for task, row in document["tasks"].items()} == rates
     assert document["mean"]["value"] == pytest.approx(np.mean([row["mean"] for row in rows]))

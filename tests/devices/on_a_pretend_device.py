@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import test_offline_trainer as offline
@@ -79,8 +80,7 @@ def test_waits_are_recorded():
     WAITS.clear()
     there = here.to(PRETEND)
     here.to(PRETEND, non_blocking=True)
-    assert len(WAITS) == 1
-    assert COPIES[-1] == (6,)
+    assert (len(WAITS), COPIES[-1]) == (1, (6,))
     for wait in (
         *(there.sum().item, there.cpu, there.nonzero, lambda: bool(there.any()), lambda: there[there > 2]),
         *(lambda: torch.equal(there, there), lambda: there[torch.tensor([1, 2])]),
@@ -100,8 +100,7 @@ def test_waits_are_recorded():
 )
 def test_step_waits_for_nothing_and_equals_the_cpus(demos, actor, sampler, turned):
     trainer = make_trainer(demos, "pretend", actor, sampler, turned)
-    assert trainer.device == PRETEND
-    assert {p.device for p in trainer.actor.parameters()} == {PRETEND}
+    assert (trainer.device, {p.device for p in trainer.actor.parameters()}) == (PRETEND, {PRETEND})
     losses = quiet_steps(trainer)
     indices = 2 if sampler == "co-learning" else 1  # indices, and which rows are the target's
     assert len(COPIES) == 3 * indices, "one copy a batch"
@@ -112,16 +111,11 @@ def test_step_waits_for_nothing_and_equals_the_cpus(demos, actor, sampler, turne
     assert_same(weights(trainer), weights(cpu))
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda demos, device: make_replay(demos, device, "co-learning"),
-        lambda demos, device: lw.LanguageWorldExperienceReplay(
-            demos, device=device, label="executed", n_steps=3, gamma=0.9
-        ),
-    ],
-    ids=["co-learning", "n steps"],
-)
+def n_step_replay(demos, device):
+    return lw.LanguageWorldExperienceReplay(demos, device=device, label="executed", n_steps=3, gamma=0.9)
+
+
+@pytest.mark.parametrize("make", [partial(make_replay, sampler="co-learning"), n_step_replay], ids=["whole", "n steps"])
 def test_batch_is_on_the_device(demos, make):
     ours, cpu = make(demos, "pretend"), make(demos, None)
     for replay in (ours, cpu):
@@ -189,8 +183,7 @@ def break_capture(batch):
 def test_step_that_cannot_be_captured_runs_as_it_is(demos, part, capture, reason):
     trainer, losses, told = steps_of(demos, "pretend", part, capture=capture)
     assert not trainer._captured.is_captured
-    assert losses == pytest.approx(steps_of(demos, "cpu", part)[1], rel=1e-5)
-    assert len(told) == (reason is not None)
+    assert (losses, len(told)) == (pytest.approx(steps_of(demos, "cpu", part)[1], rel=1e-5), reason is not None)
     assert reason is None or reason in told[0]
 
 
@@ -273,8 +266,7 @@ def test_nan_is_reported_with_its_step_and_not_written(demos, tmp_path, many):
     which = "the loss of actor 1" if many else "the loss"
     with pytest.raises(ValueError, match=f"{which} is nan at step 12: the demonstrations hold NaN, or"):
         trainer.train()
-    assert count[0] == 20
-    assert make(demos, "pretend", **options).steps == 10
+    assert (count[0], make(demos, "pretend", **options).steps) == (20, 10)
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -350,8 +342,7 @@ def test_evaluation_equals_the_cpus(kind):
 
 def make_state(rows=3):
     ids = torch.full((rows,), lw.task_id("push"))
-    state = TensorDict({"observation": torch.rand(rows, 39), "task_id": ids}, [rows])
-    return lw.QAFTransform(PLANS)(state).to(PRETEND)
+    return lw.QAFTransform(PLANS)(TensorDict({"observation": torch.rand(rows, 39), "task_id": ids}, [rows])).to(PRETEND)
 
 
 @pytest.mark.parametrize(
@@ -368,8 +359,7 @@ def test_wrong_values_raise_without_waiting(key, value, problem):
     if key == "qaf":
         state["qaf"] = state["qaf"].float()
     state[key].fill_(value)
-    readers = [ACTORS["plan"]().to(PRETEND), *([] if "qaf" in key else [lw.QAFTransform(PLANS)])]
-    for reader in readers:
+    for reader in [ACTORS["plan"]().to(PRETEND), *([] if "qaf" in key else [lw.QAFTransform(PLANS)])]:
         reader(make_state())
         WAITS.clear()
         with pytest.raises(RuntimeError, match=problem):
@@ -390,8 +380,7 @@ def test_loss_made_on_the_device_equals_the_cpus(name, condition):
     assert {tensor.device for tensor in tensors if tensor.dim()} == {PRETEND}  # all but gamma and its like
     found = total(there, batch.to(PRETEND))
     found.backward()
-    assert found.device == PRETEND
-    assert {p.grad.device for p in trained(there).values()} == {PRETEND}
+    assert (found.device, {p.grad.device for p in trained(there).values()}) == (PRETEND, {PRETEND})
     expected = total(here, batch)
     if name != "REDQ":  # which draws on both
         torch.testing.assert_close(found.cpu(), expected)
@@ -430,7 +419,6 @@ def test_environment_waits_once_a_step():
         COPIES.clear()
         state = env.step(state.set("action", action))["next"]
         assert step == 0 or (len(WAITS), len(COPIES)) == (1, 1), (WAITS, COPIES)  # a wait for the action
-    env.close()
 
 
 def test_environment_is_on_its_device():
@@ -453,14 +441,12 @@ def test_environment_is_on_its_device():
 def test_augmentations_are_on_the_rows_device():
     plans = lw.canonical_plans(PLANS, fallback=True)
     swapped, jittered = lw.transforms.SwapUnmentioned(plans, 0.5), lw.transforms.JitterTarget(plans, 0.03)
-    yaw = lw.RandomYaw(0.3, plans=plans, tilt=0.5)
-    augmented = Compose(lw.QAFTransform(plans), swapped, jittered, yaw)
+    augmented = Compose(lw.QAFTransform(plans), swapped, jittered, lw.RandomYaw(0.3, plans=plans, tilt=0.5))
     ids = torch.full((8,), lw.task_id("push"))
     rows = TensorDict(observation=torch.rand(8, 39), action=torch.rand(8, 4), task_id=ids, batch_size=[8]).to(PRETEND)
     augmented(rows)
     WAITS.clear()
-    assert {value.device for value in augmented(rows).values(True, True)} == {PRETEND}
-    assert WAITS == []
+    assert ({value.device for value in augmented(rows).values(True, True)}, WAITS) == ({PRETEND}, [])
 
 
 def test_random_draws_are_the_trainers(demos):

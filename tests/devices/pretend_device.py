@@ -40,8 +40,7 @@ class Graph:
         """Keep the tensors that an operation writes, since a capture executes nothing."""
         for number, argument in enumerate(func._schema.arguments):
             if argument.alias_info is not None and argument.alias_info.is_write:
-                value = args[number] if number < len(args) else kwargs.get(argument.name)
-                for one in pytree.tree_leaves(value):
+                for one in pytree.tree_leaves(args[number] if number < len(args) else kwargs.get(argument.name)):
                     self.before.setdefault(id(one), (one, one.clone()))
 
     def replay(self):
@@ -125,9 +124,6 @@ class PretendTensor(torch.Tensor):
 
     def __init__(self, raw):
         self.raw = raw
-
-    def __repr__(self):
-        return f"PretendTensor({self.raw})"
 
     __torch_function__ = torch._C._disabled_torch_function_impl
 

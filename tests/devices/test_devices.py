@@ -1,12 +1,12 @@
 """Devices: names, a GPU if there is one, and a pretend device that records every wait, in another process."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from commands import python_process
 from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
@@ -22,10 +22,9 @@ needs_no_gpu = pytest.mark.skipif(torch.accelerator.is_available(), reason="need
 @pytest.mark.slow
 def test_pretend_device_is_never_waited_for():
     paths = [str(HERE), *(str(HERE.parent / room) for room in ("training", "objectives")), *sys.path]
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(HERE / "on_a_pretend_device.py")]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-    options = {"cwd": HERE.parent.parent, "env": environment, "capture_output": True, "text": True, "timeout": 400}
-    done = subprocess.run(command, **options)
+    words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", HERE / "on_a_pretend_device.py"]
+    variables = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    done = python_process(*words, cwd=HERE.parent.parent, **variables)
     assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-2000:]
     assert " passed" in done.stdout
 

@@ -34,14 +34,10 @@ def trajectories(env, steps: int, state: TensorDictBase | None = None) -> dict[t
     for step in range(steps):
         state = advance(env, state, row_actions(state, step))
         states.append(state.select(*STATE, "reward", "done"))
-    episodes = {}
-    for row, key in enumerate(zip(state["task_id"].tolist(), state["episode"].tolist(), strict=True)):
-        episodes[key] = {
-            "observation": torch.stack([s["observation"][row] for s in states]),
-            "success": torch.stack([s["success"][row] for s in states]),
-            "reward": torch.stack([s["reward"][row] for s in states[1:]]),
-        }
-    return episodes
+    found = {key: torch.stack([s[key] for s in states], 1) for key in ("observation", "success")}
+    found["reward"] = torch.stack([s["reward"] for s in states[1:]], 1)
+    keys = zip(state["task_id"].tolist(), state["episode"].tolist(), strict=True)
+    return {key: {name: values[row] for name, values in found.items()} for row, key in enumerate(keys)}
 
 
 def same(left: TensorDictBase | dict, right: TensorDictBase | dict, rows=slice(None)) -> bool:

@@ -177,8 +177,7 @@ def test_blocks_give_the_policys_results(network):
     assert (whole.exclude("action") == states).all()
     assert torch.allclose(whole["action"], network(states.clone())["action"], atol=1e-6)
     for size in (1, 2, 63, 64, 65, 128, 130, 199):
-        part = in_blocks(network)(states[:size].clone())
-        assert (part == whole[:size]).all(), size
+        assert (in_blocks(network)(states[:size].clone()) == whole[:size]).all(), size
     order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
     assert torch.equal(in_blocks(network)(states[order].clone())["action"], whole["action"][order])
 

@@ -1,4 +1,6 @@
-"""LanguageWorldEnv: its specs and seeds, compared with Meta-World's own environments."""
+"""LanguageWorldEnv: its specs, seeds and options, compared with Meta-World's own environments."""
+
+from functools import partial
 
 import numpy as np
 import pytest
@@ -6,7 +8,7 @@ import torch
 from rows import ENGINES, FEW, STEPS, actions_of, advance, same, trajectories
 from speed import first_fast
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv, check_env_specs
+from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
 from lw_torchrl.envs import episode_seed
@@ -18,8 +20,7 @@ def test_specs_of_mt50(mt50, plans, contiguous):
     check_env_specs(mt50, seed=1, return_contiguous=contiguous)
     transformed = TransformedEnv(mt50, lw.QAFTransform(plans))
     check_env_specs(transformed, seed=1, return_contiguous=contiguous)
-    assert transformed.batch_size == (50,)
-    assert transformed.reset()["task_id"].tolist() == list(range(50))
+    assert (transformed.batch_size, transformed.reset()["task_id"].tolist()) == ((50,), list(range(50)))
 
 
 @pytest.mark.parametrize("reward", ["sparse", "dense"])
@@ -27,7 +28,6 @@ def test_specs_when_an_episode_ends_within_the_check(reward, plans):
     env = lw.LanguageWorldEnv(["reach", "push"], num_envs=3, max_steps=2, reward=reward)
     check_env_specs(env, seed=0, break_when_any_done="both")
     check_env_specs(TransformedEnv(env, lw.QAFTransform(plans)), break_when_any_done="both")
-    env.close()
 
 
 def test_keys_shapes_and_types(env):
@@ -40,8 +40,7 @@ def test_keys_shapes_and_types(env):
     for part, absent in ((state.exclude("next"), "reward"), (state["next"], "action")):
         shapes = {key: (tuple(value.shape), value.dtype) for key, value in part.items()}
         assert shapes == {key: value for key, value in expected.items() if key != absent}
-    assert env.row_tasks == (*FEW, *FEW)
-    assert state["task_id"].tolist() == [lw.task_id(task) for task in env.row_tasks]
+    assert (env.row_tasks, state["task_id"].tolist()) == ((*FEW, *FEW), [lw.task_id(task) for task in env.row_tasks])
     assert (env.action_spec.space.low.unique(), env.action_spec.space.high.unique()) == (-1.0, 1.0)
 
 
@@ -75,7 +74,6 @@ def test_episodes_are_numbered_by_row_and_reset():
     assert max(resets) > min(resets)
     env.set_seed(0)
     assert env.reset()["episode"].tolist() == rank, "set_seed must begin at episode 0"
-    env.close()
 
 
 @pytest.mark.slow
@@ -138,18 +136,93 @@ def test_eighty_steps_and_dense_rewards_equal_metaworlds(metaworld_env, scale, e
                 assert state["reward"][row].item() == np.float32(reward)
             successes += bool(info["success"])
     assert successes > 10, "the test needs successes"
-    env.close()
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_sparse_reward_is_the_success(engine):
     tasks = ["button-press-topdown", "handle-press", "reach"]
-    env = lw.LanguageWorldEnv(tasks, seed=0, engine=engine)
-    rollout = env.rollout(90, lw.ExpertActor(tasks))
+    rollout = lw.LanguageWorldEnv(tasks, seed=0, engine=engine).rollout(90, lw.ExpertActor(tasks))
     success, reward = rollout["next", "success"], rollout["next", "reward"]
     assert torch.equal(reward, success.float())
     assert success.any(1).all()
     assert not success.all()
     assert not rollout["next", "terminated"].any(), "success must not end an episode"
     assert not rollout["next", "done"].any()
-    env.close()
+
+
+PLANS = lw.load_plans("MT10")
+
+
+def rollout(env, steps):
+    return env.rollout(steps, lw.ExpertActor(env.tasks), break_when_any_done=False, auto_cast_to_device=False)
+
+
+@pytest.mark.parametrize("reward", ["sparse", "dense"])
+def test_frame_skip_repeats_an_action_until_the_end_of_the_episode(reward):
+    options = dict(tasks=["push", "reach"], seed=1, max_steps=18, reward=reward)
+    env, plain = lw.LanguageWorldEnv(frame_skip=4, **options), lw.LanguageWorldEnv(**options)
+    state, single = env.reset(), plain.reset()
+    generator = torch.Generator().manual_seed(0)
+    for length in (4, 4, 4, 4, 2):
+        action = torch.rand(2, 4, generator=generator) * 2 - 1
+        state = env.step(state.set("action", action))["next"]
+        total, success = torch.zeros(2, 1), torch.zeros(2, 1, dtype=torch.bool)
+        for _ in range(length):
+            single = plain.step(single.set("action", action))["next"]
+            total += single["reward"]
+            success |= single["success"]
+        torch.testing.assert_close(state["reward"], total)
+        assert torch.equal(state["success"], success)
+        assert all(torch.equal(state[key], single[key]) for key in ("observation", "done"))
+    assert state["truncated"].all()
+
+
+def test_terminate_on_success_ends_an_episode():
+    ending = rollout(lw.LanguageWorldEnv(["push", "reach"], num_envs=4, terminate_on_success=True), 200)["next"]
+    plain = rollout(lw.LanguageWorldEnv(["push", "reach"], num_envs=4), 200)["next"]
+    assert torch.equal(ending["terminated"], ending["success"])
+    assert torch.equal(ending["done"], ending["terminated"] | ending["truncated"])
+    assert not (ending["terminated"] & ending["truncated"]).any()
+    for row in range(4):
+        first = int(plain["success"][row].flatten().int().argmax())
+        assert int(ending["terminated"][row].flatten().int().argmax()) == first
+        assert torch.equal(ending["observation"][row, : first + 1], plain["observation"][row, : first + 1])
+    assert ending["episode"].max() > plain["episode"].max(), "the next episode begins"
+
+
+@pytest.mark.parametrize("options", [{}, {"terminate_on_success": True}, {"frame_skip": 3}], ids=str)
+def test_a_single_environment_has_no_dimension_of_rows(options):
+    env = TransformedEnv(lw.LanguageWorldEnv("reach", batch_size=(), seed=2, **options), lw.QAFTransform(PLANS))
+    check_env_specs(env)
+    env.set_seed(2)
+    data = env.rollout(5, lw.PlanConditionedActor(PLANS))
+    assert data.batch_size == (5,)
+    shapes = {"observation": (5, 39), "task_id": (5,), "action": (5, 4), "qaf": (5, PLANS.num_steps), "done": (5, 1)}
+    assert {key: tuple(data[key].shape) for key in shapes} == shapes
+    other = lw.LanguageWorldEnv("reach", num_envs=1, seed=2, **options)
+    assert torch.equal(other.reset()["observation"][0], data["observation"][0])
+    assert env.reset(episode=3)["episode"] == torch.tensor(3)
+    make = partial(lw.LanguageWorldEnv, "reach", batch_size=(), **options)
+    several = SerialEnv(2, [partial(make, worker=(w, 2)) for w in range(2)])
+    assert several.rollout(3)["episode"].tolist() == [[0] * 3, [1] * 3]
+    for each in (env, other, several):
+        each.close()
+
+
+def test_ids_of_a_spec_keep_their_rows_in_every_shape():
+    """TorchRL calls policies on the zeros of a spec to find out what they write."""
+    env = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], num_envs=3), lw.QAFTransform(PLANS))
+    spec = env.observation_spec["task_id"]
+    ids = spec.zero()
+    for changed, expected in (
+        (spec.clone(), ids),
+        (spec.to("cpu"), ids),
+        (spec.expand(2, 3), ids.expand(2, 3)),
+        (spec.unsqueeze(0), ids.unsqueeze(0)),
+        (spec.unsqueeze(0).squeeze(0), ids),
+        (spec[1:], ids[1:]),
+        (spec.reshape(3, 1), ids.reshape(3, 1)),
+        (spec.unflatten(0, (3, 1)), ids.reshape(3, 1)),
+    ):
+        assert torch.equal(changed.zero(), expected)
+    assert torch.equal(spec.zero((2,)), ids.expand(2, 3))

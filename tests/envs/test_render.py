@@ -18,12 +18,18 @@ from lw_torchrl._util.rendering import CAMERAS
 def _needs_open_gl():
     if missing := why_no_pictures():
         pytest.skip(missing)
+    yield
+    for env in OPENED:
+        env.close(raise_if_closed=False)
+
+
+OPENED = []
 
 
 def opened(engine="vectorized", tasks=("reach", "drawer-open"), **options):
-    env = lw.LanguageWorldEnv(list(tasks), engine=engine, seed=3, **options)
-    env.reset()
-    return env
+    OPENED.append(lw.LanguageWorldEnv(list(tasks), engine=engine, seed=3, **options))
+    OPENED[-1].reset()
+    return OPENED[-1]
 
 
 @pytest.fixture(scope="module")
@@ -31,30 +37,24 @@ def both_engines():
     envs = [opened(engine) for engine in ("vectorized", "metaworld")]
     for env in envs:
         env.rollout(5, lambda td: td.set("action", torch.full((2, 4), 0.5)))
-    yield envs
-    for env in envs:
-        env.close()
+    return envs
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_both_engines_render_the_same(both_engines, camera):
     pictures = [env.render(camera=camera, height=60, width=80) for env in both_engines]
-    assert pictures[0].shape == (2, 60, 80, 3)
-    assert pictures[0].dtype == torch.uint8
+    assert (pictures[0].shape, pictures[0].dtype) == ((2, 60, 80, 3), torch.uint8)
     assert torch.equal(*pictures)
     assert pictures[0].float().std() > 10  # not a single colour
 
 
 def test_each_row_is_rendered_with_its_own_scene():
     """Rows of one model differ in the places of bodies and sites after a reset."""
-    env = opened(tasks=["drawer-open"], num_envs=3)
-    pictures = env.render(height=60, width=80)
+    pictures = opened(tasks=["drawer-open"], num_envs=3).render(height=60, width=80)
     assert not torch.equal(pictures[0], pictures[1])
-    single = lw.LanguageWorldEnv("drawer-open", seed=3)
+    single = opened(tasks=["drawer-open"])
     single.reset(episode=1)
     assert torch.equal(single.render(height=60, width=80)[0], pictures[1])
-    env.close()
-    single.close()
 
 
 def test_rendering_does_not_change_the_simulation():
@@ -64,12 +64,8 @@ def test_rendering_does_not_change_the_simulation():
     for _ in range(8):
         seen.render(height=32, width=32)
         action = torch.rand(2, 4, generator=generator) * 2 - 1
-        states = [
-            env.step(state.set("action", action))["next"] for env, state in zip((seen, unseen), states, strict=True)
-        ]
+        states = [env.step(td.set("action", action))["next"] for env, td in zip((seen, unseen), states, strict=True)]
         assert torch.equal(states[0]["observation"], states[1]["observation"])
-    seen.close()
-    unseen.close()
 
 
 def test_sizes_may_alternate_and_two_environments_may_render():
@@ -81,7 +77,6 @@ def test_sizes_may_alternate_and_two_environments_may_render():
     assert torch.equal(first.render(height=24, width=32), small)
     first.close()
     assert torch.equal(second.render(height=24, width=32), other)
-    second.close()
 
 
 def test_two_threads_may_render_in_turn():

@@ -43,8 +43,7 @@ def test_different_triples_have_different_seeds_and_noise(left, right):
 @settings(max_examples=50, deadline=None)
 def test_noise_does_not_depend_on_the_number_of_steps(triple, steps, more, hold):
     noise = action_noise(*triple, steps, hold)
-    assert noise.shape == (steps, 4)
-    assert noise.dtype == np.float32
+    assert (noise.shape, noise.dtype) == ((steps, 4), np.float32)
     assert np.array_equal(noise, action_noise(*triple, steps + more, hold)[:steps])
     assert np.array_equal(noise, action_noise(*triple, steps)[np.arange(steps) // hold])
 

@@ -1,4 +1,4 @@
-"""LanguageWorldEnv from step to step: partial resets and steps, the end of an episode, fresh tensors."""
+"""LanguageWorldEnv from step to step: actions, partial resets and steps, ends of episodes, faults, fresh tensors."""
 
 import numpy as np
 import pytest
@@ -62,11 +62,9 @@ def test_rows_outside_a_step_mask_do_not_move(any_env, shape):
 @pytest.mark.parametrize(("options", "length"), [({}, 500), ({"max_steps": 510, "engine": "metaworld"}, 510)], ids=str)
 def test_the_length_of_an_episode(options, length):
     """Meta-World's own limit of 500 steps does not apply to max_steps=510."""
-    env = lw.LanguageWorldEnv("reach", **options)
-    rollout = env.rollout(600, lambda td: td.set("action", torch.zeros(1, 4)))
+    rollout = lw.LanguageWorldEnv("reach", **options).rollout(600, lambda td: td.set("action", torch.zeros(1, 4)))
     assert rollout.batch_size == (1, length)
     assert rollout["next", "truncated"].flatten().tolist() == [False] * (length - 1) + [True]
-    env.close()
 
 
 def test_a_row_that_has_ended_must_be_reset(any_env):
@@ -140,3 +138,131 @@ def test_writes_to_a_state_do_not_change_the_environment(env):
     for key in (*STATE, "done", "truncated", "terminated"):
         state[key].fill_(1)
     assert same(kept, advance(env, kept, torch.zeros(ROWS, 4), _step=torch.zeros(ROWS, dtype=torch.bool)))
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        torch.clone,
+        lambda values: values.t().clone().t(),
+        lambda values: torch.cat([values, values], 1)[:, ::2],
+        lambda values: values.clone().requires_grad_(),
+        lambda values: values.clone().requires_grad_() * 1.0,
+        lambda values: values[:1].clone().expand(ROWS, 4),
+    ],
+    ids=["contiguous", "transposed", "strided", "grad", "not a leaf", "expanded"],
+)
+def test_an_action_out_of_range_is_executed_clipped_and_does_not_change(any_env, layout):
+    wild = torch.linspace(-4, 4, 24).reshape(ROWS, 4)
+    wild[0, 0], wild[5, 3] = -torch.inf, torch.inf
+    action = layout(wild)
+    wild = action.detach().clone()
+    any_env.set_seed(1)
+    expected = advance(any_env, any_env.reset(), wild.clamp(-1, 1))
+    any_env.set_seed(1)
+    state = any_env.step(any_env.reset().set("action", action))
+    assert torch.equal(state["action"], wild)
+    assert torch.equal(action, wild)
+    assert torch.equal(state["next", "executed_action"], wild.clamp(-1, 1))
+    assert not state["next", "executed_action"].requires_grad
+    assert same(expected, state["next"])
+
+
+def test_executed_action_is_zero_after_reset_at_rest_and_for_nan(env):
+    env.set_seed(1)
+    state = env.reset()
+    assert not state["executed_action"].any()
+    action = torch.full((ROWS, 4), 0.5)
+    action[1, 2] = float("nan")
+    with pytest.warns(UserWarning, match="row 1: its action is NaN"):
+        state = advance(env, state, action, _step=others(0))
+    moved = others(0, 1)
+    assert torch.equal(state["executed_action"], action.where(moved[:, None], torch.zeros(())))
+    assert not env.reset(state.clone().set("_reset", ~moved))["executed_action"][~moved].any()
+
+
+@pytest.mark.parametrize(
+    "action",
+    [None, *map(torch.zeros, [(ROWS, 5), (ROWS, 3), (ROWS,), (ROWS, 1, 4)])]
+    + [torch.zeros(ROWS, 4, dtype=dtype) for dtype in (torch.float64, torch.int64, torch.bfloat16)],
+    ids=lambda a: "none" if a is None else f"{tuple(a.shape)}-{a.dtype}",
+)
+def test_a_wrong_action_is_an_error_and_moves_nothing(any_env, action):
+    any_env.set_seed(1)
+    state = any_env.reset()
+    with pytest.raises(ValueError, match=r"action must be float32 of shape \(6, 4\)"):
+        any_env.step(state.clone() if action is None else state.clone().set("action", action))
+    after = advance(any_env, state, torch.ones(ROWS, 4))
+    any_env.set_seed(1)
+    assert same(after, advance(any_env, any_env.reset(), torch.ones(ROWS, 4)))
+
+
+def test_a_row_with_a_nan_action_is_truncated_and_others_continue(any_env):
+    any_env.set_seed(2)
+    reference = trajectories(any_env, STEPS)
+    any_env.set_seed(2)
+    state = any_env.reset()
+    for step in range(3):
+        state = advance(any_env, state, row_actions(state, step))
+    before = state
+    action = row_actions(state, 3)
+    action[4, 2] = float("nan")
+    with pytest.warns(UserWarning, match="row 4: its action is NaN, in task 'push', seed 2, episode 1, step 3"):
+        state = advance(any_env, state, action)
+    for key in ("fault", "truncated", "done"):
+        assert state[key].flatten().tolist() == (~others(4)).tolist(), key
+    assert torch.equal(state["observation"][4], before["observation"][4])
+    assert not any(state[key][4] for key in ("terminated", "reward", "success"))
+    with pytest.raises(RuntimeError, match=r"rows \[4\] have ended"):
+        advance(any_env, state, action)
+
+    state = any_env.reset(state.clone().set("_reset", ~others(4)), episode=1)
+    assert state["episode"].tolist() == [0, 0, 0, 1, 1, 1]
+    assert not (state["fault"] | state["done"]).any()
+    for step in range(4, STEPS):
+        action = torch.where(others(4)[:, None], row_actions(state, step), row_actions(state, step - 4))
+        state = advance(any_env, state, action)
+        for row, key in enumerate(zip(state["task_id"].tolist(), state["episode"].tolist(), strict=True)):
+            now = step + 1 if row != 4 else step - 3
+            assert torch.equal(state["observation"][row], reference[key]["observation"][now])
+            assert torch.equal(state["reward"][row], reference[key]["reward"][now - 1])
+    assert state["done"].flatten().tolist() == others(4).tolist()
+
+
+def test_strict_raises_an_error_and_moves_nothing():
+    env = lw.LanguageWorldEnv(["push", "reach"], seed=2, strict=True)
+    state = env.reset()
+    action = torch.tensor([[1.0] * 4, [torch.nan, 1.0, 1.0, 1.0]])
+    with pytest.raises(ValueError, match="action must hold numbers: row 1"):
+        env.step(state.clone().set("action", action))
+    after = advance(env, state, torch.ones(2, 4))
+    assert not after["fault"].any()
+    env.set_seed(2)
+    assert same(after, advance(env, env.reset(), torch.ones(2, 4)))
+
+
+def test_an_unstable_simulation_truncates_its_row(tmp_path, monkeypatch):
+    """Meta-World's own environments, with a broken state; MuJoCo leaves a log where it runs."""
+    monkeypatch.chdir(tmp_path)
+    env = lw.LanguageWorldEnv("push", num_envs=3, seed=0, engine="metaworld", reward="dense")
+    rest = torch.tensor([True, False, True])
+    state = env.reset()
+    expected = [state := advance(env, state, row_actions(state, step)) for step in range(5)]
+    env.set_seed(0)
+    state = env.reset()
+    for step in range(3):
+        state = advance(env, state, row_actions(state, step))
+    env._engine._envs[1].data.qpos[:] = np.nan
+    with pytest.warns(UserWarning, match="row 1: its simulation became unstable, in task 'push', seed 0, episode 1"):
+        broken = advance(env, state, row_actions(state, 3))
+    for key in ("fault", "truncated", "done"):
+        assert broken[key].flatten().tolist() == [False, True, False]
+    assert torch.equal(broken["observation"][1], state["observation"][1])
+    assert same(broken, expected[3], rest)
+    again = advance(env, broken, row_actions(state, 4), _step=rest)
+    assert same(again, expected[4], rest)
+
+    fresh = env.reset(again.clone().set("_reset", ~rest), select_reset_only=True)
+    other = lw.LanguageWorldEnv("push", seed=0, engine="metaworld", reward="dense")
+    ((key, episode),) = trajectories(other, 2, other.reset(episode=4)).items()
+    assert same(trajectories(env, 2, fresh)[key], episode)

@@ -24,11 +24,8 @@ PLANS = lw.Plans({TASK: lw.load_plans("MT10")[TASK]})
 PROGRAM = plan_program(PLANS)
 PAIRS = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
 ALIGNED = "almost vertically aligned with the drawer handle"
-CONDITIONS = (
-    f"gripper is not {ALIGNED}",
-    f"gripper is {ALIGNED} and gripper is not near the drawer handle",
-    "gripper is near the drawer handle",
-)
+NEAR = "near the drawer handle"
+CONDITIONS = (f"gripper is not {ALIGNED}", f"gripper is {ALIGNED} and gripper is not {NEAR}", f"gripper is {NEAR}")
 REFERENCE = {TASK: lw.ConditionalPlan.from_pairs(TASK, [*zip(CONDITIONS, [skill for _, skill in PAIRS], strict=True)])}
 DECISIONS = tomllib.loads(Path(__file__).with_name("decisions.toml").read_text("utf-8"))
 RUN = {"seed": SEED, "max_steps": STEPS, "progress": False, "num_threads": 1}
@@ -69,9 +66,6 @@ class WrongEvaluator(lw.QueryEvaluator):
         answers = PROGRAM(observation, task_id)
         answers[..., 1] ^= True
         return 10.0 * answers.float() - 5.0
-
-
-# ---- planted faults
 
 
 def test_a_faulty_skill_is_found_with_its_step():
@@ -136,8 +130,7 @@ FAULTY = {
 def test_the_shape_of_a_fault_and_the_steps_that_have_it_are_measured(shape, spread):
     in_all = motion(FAULTY[shape], spread=spread)
     in_one = motion(FAULTY[shape], steps=(1,), spread=spread)
-    assert in_all.extent()[::2] == (True, shape)
-    assert in_one.extent() == (False, 1, shape)
+    assert (in_all.extent()[::2], in_one.extent()) == ((True, shape), (False, 1, shape))
     if not spread:
         assert in_all.extent(exact=True)[0] is True
         assert in_one.extent(exact=True) == (False, 1, shape)
@@ -146,8 +139,7 @@ def test_the_shape_of_a_fault_and_the_steps_that_have_it_are_measured(shape, spr
 def test_a_fault_that_would_not_show_elsewhere_may_be_in_all_steps():
     wanted = torch.rand(60, 1) + 0.2
     wanted[30:] = 0.0
-    still = Motion(wanted, -wanted, (torch.arange(60) >= 30).long())
-    assert still.extent() == (None, 0, "scaled")
+    assert Motion(wanted, -wanted, (torch.arange(60) >= 30).long()).extent() == (None, 0, "scaled")
     assert Motion(wanted, -wanted, torch.zeros(60)).extent()[0] is None, "there are no other steps"
     assert Motion(wanted[:3], wanted[:3], torch.zeros(3)).extent()[0] is None, "too few states"
 
@@ -155,8 +147,7 @@ def test_a_fault_that_would_not_show_elsewhere_may_be_in_all_steps():
 def test_noise_is_told_from_a_fault():
     """Noise has no shape, and its error is the same in all plan steps."""
     generator = torch.Generator().manual_seed(2)
-    noisy = motion(lambda action: action + torch.randn(60, 3, generator=generator))
-    assert noisy.extent()[2] == "irregular"
+    assert motion(lambda action: action + torch.randn(60, 3, generator=generator)).extent()[2] == "irregular"
 
 
 def test_a_faulty_plan_is_found_with_its_step():
@@ -200,11 +191,7 @@ def test_an_episode_that_no_replacement_repairs_is_undecided():
 def test_a_gap_in_the_plan_is_not_a_skills_fault():
     """Where no condition holds, networks attend to all steps: scripts instead of them would hide the gap."""
     [failure] = evaluated(still(plans_of(PAIRS[1:]))).failures
-    assert failure.cause == "undecided"
-    assert failure.evidence["no_condition_late"] == 1.0
-
-
-# ---- every kind of policy
+    assert (failure.cause, failure.evidence["no_condition_late"]) == ("undecided", 1.0)
 
 
 class Still(lw.PlanConditionedActor):
@@ -238,8 +225,7 @@ def test_a_networks_skills_are_replaced_and_its_mode_stays(wrapped):
 def test_a_plan_that_is_not_understood_is_never_called_sound(is_canonical):
     pairs = [("gripper is not near the drawer handle", "dance a waltz"), ("gripper is near the drawer handle", "bow")]
     plans = lw.canonical_plans(plans_of(pairs)) if is_canonical else plans_of(pairs)
-    actor = still(plans, text_encoder=lambda texts: torch.ones(len(texts), 3))
-    [failure] = evaluated(actor, max_steps=120).failures
+    [failure] = evaluated(still(plans, text_encoder=lambda texts: torch.ones(len(texts), 3)), max_steps=120).failures
     assert failure.succeeds_at is not None
     assert "(Meta-World's expert in 2 steps without a scripted skill) the same episode succeeds" in failure.why
     unsound = ", and the expert does not follow the plan, so this does not show that the plan is sound"
@@ -280,13 +266,9 @@ class Completing(lw.ScriptedSkillActor):
 
 
 def test_a_policy_may_complete_the_reference():
-    actor = Completing(faulty_plans(), skills=faulty_skill(step=2)._skills)
-    [failure] = evaluated(actor, reference=REFERENCE).failures
+    [failure] = evaluated(Completing(faulty_plans(), skills=faulty_skill(step=2)._skills), reference=REFERENCE).failures
     assert {failure.cause, failure.also} == {"plan", "skill"}
     assert len(failure.mended.plan.steps) == failure.mended.steps["skill_weights"].shape[1] == 4
-
-
-# ---- reproducibility
 
 
 def test_failures_do_not_depend_on_the_number_of_environments():
@@ -294,9 +276,6 @@ def test_failures_do_not_depend_on_the_number_of_environments():
     result = evaluated(actor, episodes=2, reference=REFERENCE)
     assert evaluated(actor, episodes=2, reference=REFERENCE, num_envs=1).failures == result.failures
     assert [failure.episode for failure in result.failures] == [0, 1]
-
-
-# ---- the decision
 
 
 @pytest.mark.parametrize("name", DECISIONS)
@@ -312,8 +291,7 @@ def test_two_parts_are_blamed_if_only_both_help():
 
 def test_the_active_step_has_most_attention():
     weights = torch.tensor([[0.4999, 0.5, 0.0001], [1 / 3] * 3, [0.5, 0.5, 0.0], [1.0, 0.0, 0.0]])
-    steps = torch.arange(3) < torch.tensor([[3], [3], [2], [1]])
-    assert attended(weights, steps).tolist() == [1, -1, -1, 0]
+    assert attended(weights, torch.arange(3) < torch.tensor([[3], [3], [2], [1]])).tolist() == [1, -1, -1, 0]
     answers = torch.tensor([[False, True, True], [False, False, False], [False, False, True]])
     assert chosen(answers, 3).tolist() == [1, 2, 2]
 
@@ -331,11 +309,7 @@ def test_a_step_stalls_where_the_hand_stands_still():
 def test_a_stay_may_be_interrupted_briefly():
     states = torch.zeros(100, dtype=torch.bool)
     states[[3, 40, 60, 61, 80]] = True
-    assert last_stay_start(states) == 40
-    assert last_stay_start(torch.zeros(5, dtype=torch.bool)) == 4
-
-
-# ---- refused
+    assert (last_stay_start(states), last_stay_start(torch.zeros(5, dtype=torch.bool))) == (40, 4)
 
 
 def rollout(steps=3, **changed):
@@ -366,8 +340,7 @@ def test_wrong_rollouts_are_refused(rollouts, message):
 def test_without_failed_episodes_there_are_no_failures():
     assert attribute_failures([], PLANS, actor=faulty_skill(), seed=0) == []
     result = evaluated(lw.ScriptedSkillActor(PLANS))
-    assert result.failures == ()
-    assert result.success_once == {TASK: 1.0}
+    assert (result.failures, result.success_once) == ((), {TASK: 1.0})
 
 
 def test_the_repaired_episode_is_kept_and_can_be_simulated_again():

@@ -1,4 +1,4 @@
-"""evaluate runs exactly the requested episodes, bit for bit on any number of environments, as Meta-World's own envs."""
+"""evaluate runs the requested episodes, bit for bit on any number of environments, as Meta-World does; PlanUse."""
 
 import itertools
 from dataclasses import replace
@@ -6,23 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
-from lw_torchrl.envs import ExpertActor
+import lw_torchrl as lw
+from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.rows import action_noise, episode_seed
 from lw_torchrl.evaluation import evaluate
-from lw_torchrl.language.plan_files import load_plans
-from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
+from lw_torchrl.evaluation.plan_use import PlanUse, expert_use
 from lw_torchrl.suites.metaworld.environments import MetaWorldEngine, make_metaworld_env
 from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
-from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
-from lw_torchrl.transforms import QAFTransform
 
-PLANS = load_plans("MT10")
+PLANS = lw.load_plans("MT10")
 SEED = 1000
 
 
@@ -33,7 +30,7 @@ def run(actor, tasks, **changed):
 
 def make_actor(seed=0, **options):
     torch.manual_seed(seed)
-    return PlanConditionedActor(PLANS, **options)
+    return lw.PlanConditionedActor(PLANS, **options)
 
 
 def by_episode(result):
@@ -48,19 +45,16 @@ def assert_same(result, expected):
         assert torch.equal(episodes[key].actions, expected[key].actions), key
 
 
-# ---- which episodes
-
-
 @pytest.mark.parametrize("num_envs", [None, 5])
 def test_exactly_k_episodes_of_each_task(num_envs):
-    result = run(ExpertActor(["push", "reach"]), ["reach", "push"], num_envs=num_envs, max_steps=4)
+    result = run(lw.ExpertActor(["push", "reach"]), ["reach", "push"], num_envs=num_envs, max_steps=4)
     assert [(e.task, e.episode) for e in result.episodes] == list(itertools.product(["push", "reach"], range(3)))
     assert all(e.actions.shape == (4, 4) and e.actions.dtype == torch.float32 for e in result.episodes)
     assert (result.config["tasks"], result.config["seed"]) == (["push", "reach"], SEED)
-    other = run(ExpertActor("push"), "push", max_steps=4, seed=SEED + 1, noise_scale=0.0).episodes[0]
-    same = run(ExpertActor("push"), "push", max_steps=4, noise_scale=0.0).episodes[0]
+    other = run(lw.ExpertActor("push"), "push", max_steps=4, seed=SEED + 1, noise_scale=0.0).episodes[0]
+    same = run(lw.ExpertActor("push"), "push", max_steps=4, noise_scale=0.0).episodes[0]
     assert not torch.equal(other.actions, same.actions)
-    assert run(ExpertActor("push"), "push", max_steps=2, record_actions=False).episodes[0].actions is None
+    assert run(lw.ExpertActor("push"), "push", max_steps=2, record_actions=False).episodes[0].actions is None
 
 
 @pytest.fixture(scope="module")
@@ -87,13 +81,10 @@ def test_an_episode_does_not_depend_on_rows_other_tasks_other_episodes_or_the_en
 
 
 def test_a_plain_function_runs_as_a_module_does():
-    actor = DescriptorConditionedActor("MT10").eval()
+    actor = lw.modules.DescriptorConditionedActor("MT10").eval()
     expected = run(actor, "reach", num_envs=1, max_steps=15)
     assert_same(run(lambda state: actor(state), "reach", num_envs=3, max_steps=15), expected)
     assert_same(run(actor, "reach", num_envs=3, max_steps=15), expected)
-
-
-# ---- executed actions
 
 
 def test_the_noise_depends_on_the_episode_and_is_clipped():
@@ -116,19 +107,18 @@ def assert_equal_in_metaworld(result):
         assert any(success) == e.success, (e.task, e.episode)
         assert (success.index(True) + 1 if any(success) else None) == e.first_success
         if e.success_at_end is not None:
-            assert success[-1] == e.success_at_end
-            assert sum(success) == e.episode_return
+            assert (success[-1], sum(success)) == (e.success_at_end, e.episode_return)
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A policy that sometimes opens drawers."""
     root, options = tmp_path_factory.mktemp("demos") / "demos", {"max_steps": 150, "progress": False}
-    collect_demonstrations(["drawer-open", "reach"], episodes_per_task=4, root=root, noise_scale=(0, 0.2), **options)
-    parts = {"sampler": TaskBalancedSampler(), "transform": QAFTransform(PLANS)}
-    replay, actor = LanguageWorldExperienceReplay(root, after_success=20, **parts), make_actor()
-    config = BehavioralCloningConfig(steps=400, batch_size=100)
-    BehavioralCloningTrainer(actor, replay, config, progress=False).train()
+    lw.collect_demonstrations(["drawer-open", "reach"], episodes_per_task=4, root=root, noise_scale=(0, 0.2), **options)
+    parts = {"sampler": lw.TaskBalancedSampler(), "transform": lw.QAFTransform(PLANS)}
+    replay, actor = lw.LanguageWorldExperienceReplay(root, after_success=20, **parts), make_actor()
+    config = lw.BehavioralCloningConfig(steps=400, batch_size=100)
+    lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
     return actor
 
 
@@ -146,7 +136,7 @@ def test_a_trained_policys_actions_succeed_equally_in_metaworlds_own_environment
 
 @pytest.mark.slow
 def test_the_experts_actions_succeed_equally_in_metaworlds_own_environments():
-    result = run(ExpertActor("MT10"), "MT10", episodes_per_task=2, max_steps=500, num_envs=13)
+    result = run(lw.ExpertActor("MT10"), "MT10", episodes_per_task=2, max_steps=500, num_envs=13)
     assert [e.success for e in result.episodes].count(True) >= 15
     assert {e.success_at_end for e in result.episodes} == {True, False}
     assert_equal_in_metaworld(result)
@@ -166,17 +156,14 @@ def test_stopping_at_success_does_not_change_the_success_rate(trained, whole, nu
 
 
 def test_the_return_is_the_sum_of_dense_rewards():
-    sparse = run(ExpertActor("reach"), "reach", max_steps=60)
-    dense = run(ExpertActor("reach"), "reach", max_steps=60, reward="dense")
+    sparse = run(lw.ExpertActor("reach"), "reach", max_steps=60)
+    dense = run(lw.ExpertActor("reach"), "reach", max_steps=60, reward="dense")
     assert all(a.episode_return > b.episode_return for a, b in zip(dense.episodes, sparse.episodes, strict=True))
     env = make_metaworld_env("reach", max_steps=60)
     env.seed(episode_seed("reach", SEED, 0))
     env.reset()
     total = sum(np.float32(env.step(action.numpy())[1]) for action in dense.episodes[0].actions)
     assert dense.episodes[0].episode_return == pytest.approx(total, rel=1e-5)
-
-
-# ---- how the actor is run
 
 
 class Recorder(nn.Module):
@@ -216,19 +203,16 @@ def test_an_unstable_simulation_is_a_failed_episode(monkeypatch):
         return result
 
     monkeypatch.setattr(VectorizedEngine, "step", unstable)
-    expert = ExpertActor("reach")
+    expert = lw.ExpertActor("reach")
     with pytest.warns(UserWarning, match="unstable, in task 'reach', seed 1000, episode 1"):
         result = evaluate(expert, tasks="reach", episodes_per_task=3, seed=1000, num_envs=3, progress=False)
     assert [episode.success for episode in result.episodes] == [True, False, True]
 
 
-# ---- plans
-
-
 def test_an_actor_is_evaluated_on_its_own_plans():
     actor = make_actor(text_encoder=lambda texts: torch.eye(len(texts), 40))
     pairs = [("the gripper is open", "move the gripper to the reach target")]
-    other_plans = Plans([ConditionalPlan.from_pairs("reach", pairs)])
+    other_plans = lw.Plans([lw.ConditionalPlan.from_pairs("reach", pairs)])
     with pytest.raises(ValueError, match=r"plans differ from the actor's plans for reach; .*with_plans"):
         run(actor, "reach", plans=other_plans)
     other, own = (run(each, "reach", max_steps=8) for each in (actor.with_plans(other_plans), actor))
@@ -247,7 +231,7 @@ def test_an_actor_without_plans_receives_the_answers_for_given_plans():
 
 
 def test_the_actors_tasks_or_else_its_plans_are_the_default():
-    assert set(run(ExpertActor(["push", "reach"]), None).success_once) == {"push", "reach"}
+    assert set(run(lw.ExpertActor(["push", "reach"]), None).success_once) == {"push", "reach"}
     assert set(run(make_actor(), None, episodes_per_task=1).success_once) == set(PLANS)
     with pytest.raises(ValueError, match="tasks is required"):
         run(lambda state: state, None)
@@ -260,3 +244,51 @@ def test_keys_of_the_environment_and_of_the_actor_are_recorded():
     (finished,) = episodes
     assert (finished.task, finished.episode, finished.steps.batch_size) == ("reach", 0, (3,))
     assert all(key in finished.steps.keys(True) for key in keys)
+
+
+REACH = {"reach": lw.load_plans("MT10")["reach"]}  # three steps
+
+
+def episode(number, steps, success_at=None, weights=True):
+    """An episode in which at step t only condition ``steps[t]`` holds, none for -1, and its skill is chosen."""
+    chosen = torch.tensor(steps)
+    qaf = torch.nn.functional.one_hot(chosen.clamp(min=0), 4).bool() & (chosen >= 0)[:, None]
+    success = torch.zeros(len(steps), 1, dtype=torch.bool)
+    if success_at is not None:
+        success[success_at] = True
+    rows = TensorDict({"qaf": qaf, "next": TensorDict({"success": success}, [len(steps)])}, [len(steps)])
+    if weights:
+        rows["skill_weights"] = torch.nn.functional.one_hot(chosen.clamp(min=0), 4).float()
+    return FinishedEpisode("reach", number, rows)
+
+
+def test_states_count_until_20_steps_after_the_first_success():
+    use = PlanUse(REACH)
+    use(episode(0, [0] * 10 + [1] * 5 + [2] * 100, success_at=14))
+    reach = use.tasks()["reach"]
+    assert (reach.states, reach.true, reach.chosen) == (35, pytest.approx([10 / 35, 5 / 35, 20 / 35]), reach.true)
+    assert (reach.covered, reach.num_true, reach.failed, reach.stuck) == (1.0, 1.0, 0, [0, 0, 0])
+
+
+def test_gaps_and_stuck_steps_of_failures_are_counted():
+    use = PlanUse(REACH)
+    use(episode(0, [0] * 30 + [1] * 60 + [-1] * 10))
+    use(episode(1, [2] * 200))
+    use(episode(2, [-1] * 3 + [0] * 4 + [-1] + [0] * 12 + [-1] * 30, success_at=29))
+    reach = use.tasks()["reach"]
+    assert (reach.failed, reach.stuck, reach.gaps) == (2, [0, 1, 1], [(0, 90, 99), (2, 0, 2), (2, 7, 7), (2, 20, 29)])
+    assert abs(reach.covered - 306 / 330) < 1e-6
+
+
+def test_true_conditions_count_where_no_step_is_chosen():
+    use = PlanUse(REACH)
+    use(episode(0, [0, 1, 1], weights=False))
+    reach = use.tasks()["reach"]
+    assert (reach.chosen, reach.stuck, reach.to_json()["states"]) == ([], [0, 1, 0], 3)
+
+
+def test_experts_stop_after_the_states_that_count():
+    tasks, plans = ["drawer-open", "reach"], lw.load_plans("MT10")
+    whole, options = PlanUse(plans), {"seed": 4, "max_steps": 250, "noise_scale": 0.0, "also_record": ["qaf"]}
+    lw.evaluate(lw.ExpertActor(tasks), tasks=tasks, plans=plans, episodes_per_task=2, on_episode=whole, **options)
+    assert expert_use(plans, tasks, episodes_per_task=2, seed=4) == whole.tasks()

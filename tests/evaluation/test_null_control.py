@@ -71,8 +71,7 @@ def test_the_first_difference_between_two_runs_is_found():
 def test_a_wrong_observation_is_found(inside):
     actor = Altered(scripted(), shown=moved_thing(0.1, 0.0)) if inside else scripted()
     evaluator = None if inside else Sensor(PLANS, 0.1)
-    episodes = run(actor, evaluator=evaluator)
-    [failure] = attribute_failures(episodes, PLANS, actor=actor, evaluator=evaluator, **RUN)
+    [failure] = attribute_failures(run(actor, evaluator=evaluator), PLANS, actor=actor, evaluator=evaluator, **RUN)
     assert failure.cause == failure.mended.by == "perception"
     assert failure.counterfactuals["perception"] is True
     assert failure.finding.kind == "wrong observation"
@@ -105,8 +104,7 @@ def test_a_wrapper_that_is_a_function_is_seen():
         tensordict = policy(tensordict)
         return tensordict.set("action", tensordict["action"] * torch.tensor([-1.0, 1.0, 1.0, 1.0]))
 
-    episodes = run(mirrored, plans=PLANS)
-    [failure] = attribute_failures(episodes, PLANS, actor=mirrored, **RUN)
+    [failure] = attribute_failures(run(mirrored, plans=PLANS), PLANS, actor=mirrored, **RUN)
     assert (failure.cause, failure.replaced) == ("actuation", "wrapper")
     assert (failure.finding.kind, failure.finding.values["shape"]) == ("wrapped action", "scaled")
 
@@ -136,8 +134,7 @@ def test_a_first_state_of_another_seed_is_another_environment():
 
 @pytest.mark.slow
 def test_noise_is_blamed_for_what_noise_does():
-    episodes = run(scripted(), noise_scale=1.0)
-    [failure] = attribute_failures(episodes, PLANS, actor=scripted(), **RUN, noise_scale=1.0)
+    [failure] = attribute_failures(run(scripted(), noise_scale=1.0), PLANS, actor=scripted(), **RUN, noise_scale=1.0)
     assert (failure.cause, failure.counterfactuals["no noise"]) == ("noise", True)
 
 

@@ -29,8 +29,7 @@ CONFIG |= {"stop_at_success": False, "reward": "sparse", "max_steps": 500}
 def make_result():
     push = [(10, False, 4.0, torch.zeros(500, 4)), (21, True, 480.0), (None, False, 0.0)]
     reach = [(1, True, 500.0), (2, True, 499.0), (6, True, 495.0)]
-    outcomes = {"push": push, "reach": reach, "sweep": 3 * [(None, False, 0.0)]}
-    return EvaluationResult(CONFIG, episodes(outcomes))
+    return EvaluationResult(CONFIG, episodes({"push": push, "reach": reach, "sweep": 3 * [(None, False, 0.0)]}))
 
 
 def episodes(outcomes):
@@ -64,9 +63,6 @@ def attributed(failures=FAILURES):
     return EvaluationResult(config, episodes(outcomes), failures=failures)
 
 
-# ---- statistics, tables and figures
-
-
 def test_the_statistics_equal_those_by_hand():
     result = make_result()
     assert result.success_once == {"push": pytest.approx(2 / 3), "reach": 1.0, "sweep": 0.0}
@@ -84,10 +80,8 @@ def test_statistics_that_a_stopped_episode_lacks_are_none():
 
 def test_the_table_shows_every_task():
     lines = make_result().table().splitlines()
-    assert len(lines) == 5
-    assert lines[1].split() == ["push", "0.67", "0.33", "16"]
-    assert lines[3].split() == ["sweep", "0.00", "0.00", "-"]
-    assert lines[4].split() == ["mean", "0.56", "0.44", "-"]
+    assert (len(lines), lines[1].split()) == (5, ["push", "0.67", "0.33", "16"])
+    assert (lines[3].split(), lines[4].split()) == (["sweep", "0.00", "0.00", "-"], ["mean", "0.56", "0.44", "-"])
     assert stopped().table().splitlines()[1].split() == ["reach", "0.50", "-", "9"]
 
 
@@ -119,8 +113,7 @@ def test_the_interval_contains_the_rate_and_is_symmetric(trials, data):
     assert 0 <= low <= successes / trials + 1e-12
     assert successes / trials - 1e-12 <= high <= 1
     assert high - low > 0
-    mirrored = wilson_interval(trials - successes, trials)
-    assert (1 - high, 1 - low) == pytest.approx(mirrored, abs=1e-9)
+    assert (1 - high, 1 - low) == pytest.approx(wilson_interval(trials - successes, trials), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -135,8 +128,7 @@ def test_figures_are_written_as_png_and_pdf(tmp_path):
     path = tmp_path / "runs" / "success.png"
     plot_success(make_result(), path, title="a title")
     content = path.read_bytes()
-    assert content[:8] == b"\x89PNG\r\n\x1a\n"
-    assert content[-8:-4] == b"IEND"
+    assert (content[:8], content[-8:-4]) == (b"\x89PNG\r\n\x1a\n", b"IEND")
     width, height = struct.unpack(">II", content[16:24])
     assert min(width / 4, height) > 150
     plot_success(make_result(), tmp_path / "success.pdf")
@@ -157,9 +149,6 @@ def test_no_window_is_opened_and_no_backend_chosen(monkeypatch):
     assert "matplotlib.pyplot" not in sys.modules
 
 
-# ---- files
-
-
 DIFFERENCE = replace(FAILURES[0], finding=Finding("other actions", {"at": 3, "size": 0.5}))
 RESULTS = [make_result(), stopped(), attributed(), attributed((DIFFERENCE, *FAILURES[1:]))]
 
@@ -169,8 +158,7 @@ def test_a_saved_result_reads_back(tmp_path, result):
     first, second = tmp_path / "runs" / "results.json", tmp_path / "again.json"
     result.save(first)
     loaded = EvaluationResult.load(first)
-    assert loaded == result
-    assert (loaded.success_once, loaded.first_success) == (result.success_once, result.first_success)
+    assert (loaded, loaded.success_once, loaded.first_success) == (result, result.success_once, result.first_success)
     loaded.save(second)
     assert first.read_bytes() == second.read_bytes()
 
@@ -224,9 +212,7 @@ def test_there_must_be_one_failure_for_each_failed_episode(tmp_path, failures):
         EvaluationResult.load(path)
 
 
-@pytest.mark.parametrize(
-    "finding", [{"kind": "other", "values": {}}, {"kind": "active step", "values": {"step": 0}}, 3]
-)
+@pytest.mark.parametrize("finding", [{"kind": "odd", "values": {}}, {"kind": "active step", "values": {"step": 0}}, 3])
 def test_a_finding_without_its_values_is_refused(tmp_path, finding):
     change = {"failures 1 finding": json.dumps(finding)}
     with pytest.raises(ValueError, match=r"[Ff]inding|kind"):
@@ -284,8 +270,7 @@ def test_the_recorded_version_is_that_of_the_running_code(monkeypatch):
     # An old editable install reports the version that it was installed with.
     monkeypatch.setattr("lw_torchrl._util.reproducibility.version", lambda name: "0.0.1")
     versions = package_versions()
-    assert versions["lw_torchrl"] == lw_torchrl.__version__
-    assert versions["torch"] == "0.0.1"
+    assert (versions["lw_torchrl"], versions["torch"]) == (lw_torchrl.__version__, "0.0.1")
 
 
 def test_the_file_records_its_origin(tmp_path):

@@ -13,17 +13,7 @@ from toy_suite import SKILLS, TASKS, TOY, ToyEngine, make_toy_suite
 import lw_torchrl as lw
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
-from lw_torchrl.modules import (
-    ActorEnsemble,
-    Concat,
-    FocusFeatures,
-    MLPDecoder,
-    ObservationFeatures,
-    RoleFeatures,
-    SkillEncoder,
-    TransferredActor,
-    transform_of,
-)
+from lw_torchrl.modules import Concat, ObservationFeatures, RoleFeatures, TransferredActor, transform_of
 from lw_torchrl.record.verdict import action_names
 from lw_torchrl.suites import SUITES, Suite, check_suite, find_suite, load_suite
 
@@ -32,7 +22,10 @@ CANONICAL = lw.canonical_plans(SUITE.plans)
 
 
 def small(actions=7):
-    return {"skill_encoder": SkillEncoder(4, width=8), "decoder": MLPDecoder(width=16, depth=1, actions=actions)}
+    return {
+        "skill_encoder": lw.modules.SkillEncoder(4, width=8),
+        "decoder": lw.modules.MLPDecoder(width=16, depth=1, actions=actions),
+    }
 
 
 def role_actor(plans, actions=7):
@@ -61,11 +54,8 @@ def test_environment_follows_torchrls_rules():
     env = lw.LanguageWorldEnv("toy", suite=SUITE, num_envs=4)
     assert (env.tasks, env.max_steps, env.layout) == (("toy/touch-blue", "toy/touch-red"), 30, TOY)
     check_env_specs(env)
-    both = TransformedEnv(env, lw.QAFTransform(SUITE.plans))
-    assert both.rollout(3)["qaf"].shape == (4, 3, 2)
-    first = env.reset(episode=2)["observation"]
-    assert torch.equal(first, env.reset(episode=2)["observation"])
-    env.close()
+    assert TransformedEnv(env, lw.QAFTransform(SUITE.plans)).rollout(3)["qaf"].shape == (4, 3, 2)
+    assert torch.equal(env.reset(episode=2)["observation"], env.reset(episode=2)["observation"])
 
 
 def test_scripted_plans_demonstrate_and_datasets_keep_the_layout(demos):
@@ -96,13 +86,12 @@ def test_features_have_the_layouts_width(features, demos):
     transform = Compose(lw.QAFTransform(plans), lw.transforms.SwapUnmentioned(plans, 0.5))
     replay = lw.LanguageWorldExperienceReplay(demos.root, transform=transform)
     observed = ObservationFeatures(features, layout=TOY)
-    actor = lw.PlanConditionedActor(plans, features=Concat(observed, FocusFeatures(plans)), **small())
+    actor = lw.PlanConditionedActor(plans, features=Concat(observed, lw.modules.FocusFeatures(plans)), **small())
     config = lw.BehavioralCloningConfig(steps=2, batch_size=8)
     lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
     pairs = 10  # of hand, three blocks and goal
     widths = {"raw": 16, "relative": 9 * pairs, "differences": 9 * pairs + 2, "both": 16 + 9 * pairs + 2}
-    assert observed.width == widths[features]
-    assert actor.spec["action"].shape == (7,)
+    assert (observed.width, actor.spec["action"].shape) == (widths[features], (7,))
 
 
 def test_policy_is_trained_saved_evaluated_and_recorded(demos, tmp_path):
@@ -144,7 +133,7 @@ def test_failures_are_attributed_with_the_suites_skills():
 def test_metaworld_policy_acts_in_the_suite_and_is_saved(tmp_path):
     """The policy is not trained: only sizes, units and signs are tested."""
     trained = role_actor(lw.load_plans("MT10"), 4).eval()
-    moved = TransferredActor(ActorEnsemble([trained, trained]), CANONICAL)
+    moved = TransferredActor(lw.modules.ActorEnsemble([trained, trained]), CANONICAL)
     converted = moved.converted(torch.tensor([[0.5, -1.0, 0.2, 0.7], [0.0, 0.0, 0.0, 0.2]]))
     torch.testing.assert_close(converted[0], torch.tensor([0.0, 0.5, -1.0, 0.2, 0.0, 0.0, -1.0]))
     assert converted[1, 6] == 1.0  # efforts below 0.3 open the gripper, and here -1 closes
@@ -156,10 +145,8 @@ def test_metaworld_policy_acts_in_the_suite_and_is_saved(tmp_path):
     assert (again.layout, again.trained, again.speed) == (TOY, METAWORLD, 6.0)
     action = again.converted(torch.tensor([0.5, -1.0, 0.2, 0.7]))
     torch.testing.assert_close(action, torch.tensor([0.0, 0.6, -1.0, 0.24, 0.0, 0.0, -1.0]))
-    env = lw.LanguageWorldEnv("toy", suite=SUITE)
-    state = transform_of(again)(env.reset())
+    state = transform_of(again)(lw.LanguageWorldEnv("toy", suite=SUITE).reset())
     assert torch.equal(again(state.clone())["action"], faster(state.clone())["action"])
-    env.close()
 
 
 def test_suites_are_found_by_name(monkeypatch):

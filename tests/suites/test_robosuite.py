@@ -1,11 +1,10 @@
 """The example's suite of robosuite: its check, its seeds, its plans, and the script itself."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from commands import python_process
 
 import lw_torchrl as lw
 from lw_torchrl.modules import Concat, MLPDecoder, ObservationFeatures, RoleFeatures
@@ -43,13 +42,7 @@ def test_example_runs_a_metaworld_policy(suite, tmp_path):
     actor = lw.PlanConditionedActor(plans, features=features, decoder=MLPDecoder(width=8))
     lw.save_actor(actor, tmp_path / "policy.safetensors")
     options = ["--episodes", "1", "--steps", "5", "--arms", "Panda", "IIWA"]
-    done = subprocess.run(
-        [sys.executable, str(EXAMPLES / "suite_robosuite.py"), str(tmp_path / "policy.safetensors"), *options],
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == "Panda lift: 0.00\nIIWA lift: 0.00\n"
+    done = python_process(EXAMPLES / "suite_robosuite.py", tmp_path / "policy.safetensors", *options, timeout=240)
+    assert (done.returncode, done.stdout) == (0, "Panda lift: 0.00\nIIWA lift: 0.00\n"), done.stderr
     assert "Warning" not in done.stderr
     assert "robosuite" not in done.stderr

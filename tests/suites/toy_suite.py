@@ -21,19 +21,14 @@ def _task(name: str, block: str, at: int) -> lw.Task:
 
 
 TASKS = {task.name: task for task in (_task("touch-red", "red block", 4), _task("touch-blue", "blue block", 10))}
-SKILLS = {
-    f"move the gripper to the {block}": ScriptedSkill(f"move the gripper to the {block}", block, gripper=1.0)
-    for block in ("red block", "blue block")
-}
+MOVES = {f"move the gripper to the {block}": block for block in ("red block", "blue block")}
+SKILLS = {text: ScriptedSkill(text, block, gripper=1.0) for text, block in MOVES.items()}
 
 
 def _plan(task: lw.Task) -> lw.ConditionalPlan:
     block = task.object_names[1]
-    pairs = [
-        (f"the robot's gripper is not near the {block}", f"move the gripper to the {block}"),
-        (f"the robot's gripper is near the {block}", f"move the gripper to the {block}"),
-    ]
-    return lw.ConditionalPlan.from_pairs(task, pairs)
+    conditions = [f"the robot's gripper is {relation} the {block}" for relation in ("not near", "near")]
+    return lw.ConditionalPlan.from_pairs(task, [(each, f"move the gripper to the {block}") for each in conditions])
 
 
 class ToyEngine:

@@ -71,9 +71,6 @@ def test_table_shows_means_and_differences(out):
     assert (out / "quick.png").stat().st_size > 10_000
 
 
-# ---- losses with imitation by l1
-
-
 TWO = lw.Plans([PLANS[task] for task in ("drawer-open", "reach")])
 SIZE = {"width": 16, "depth": 1}
 TASKS = torch.tensor([lw.task_id(task) for task in TWO]).repeat_interleave(4)

@@ -1,4 +1,4 @@
-"""Runs of the paper's experiments: done once, and resumed to the same result."""
+"""Runs of the paper's experiments: done once, and resumed to the same result; many actors trained at once."""
 
 import json
 from dataclasses import replace
@@ -6,25 +6,26 @@ from functools import partial
 from unittest.mock import patch
 
 import pytest
+import torch
+from speed import first_fast
+from torchrl.envs import Compose
 
 import lw_torchrl as lw
 from benchmarks.paper import runs
 from benchmarks.paper.imitation import SCRIPTED, ImitationRun
 from benchmarks.paper.recipes import PRESETS, SETTINGS, DataSetting, Execution, Member
 from benchmarks.paper.stacked import StackedBehavioralCloning
-from lw_torchrl.modules import plans_of
+from lw_torchrl.modules import Concat, FocusFeatures, MLPDecoder, ObservationFeatures, plans_of
+from lw_torchrl.transforms import SwapUnmentioned
 
 PLANS = lw.load_plans("MT50")
 TINY = DataSetting("tiny", "reach", 2)
 TINY_ONE_SHOT = DataSetting("tiny-one-shot", "reach", 2, targets="push")
 FOCUS = {"focus": True, "canonical": True, "swap_unmentioned": 0.5}
 MEMBER = Member({"features": "differences", "width": 32, "depth": 1}, FOCUS)
-PRESET = replace(
-    PRESETS["strong"]["few-shot"],
-    target=Execution("target", (0.0,)),
-    members=(MEMBER,),
-    training=lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20),
-)
+TRAINING = lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20)
+PARTS = {"target": Execution("target", (0.0,)), "members": (MEMBER,), "training": TRAINING}
+PRESET = replace(PRESETS["strong"]["few-shot"], **PARTS)
 ROLES = {"features": "opening", "roles": True, "jitter": 0.03, "any_yaw": True}
 OTHER = Member({"features": "relative", "width": 16, "depth": 1, "yaw": 0.3}, ROLES)
 ENSEMBLE = replace(PRESET, name="ensemble", members=(MEMBER, OTHER))
@@ -64,12 +65,8 @@ def stop_training(monkeypatch, setting, at):
     return count
 
 
-RUNS = [
-    *(a_run(method) for method in ("pcbc", "dc", "one-hot", SCRIPTED)),
-    a_run(setting=TINY_ONE_SHOT),
-    *(a_run(setting=setting, preset=ENSEMBLE) for setting in (TINY, TINY_ONE_SHOT)),
-    a_run(preset=WATCHED),
-]
+RUNS = [*map(a_run, ("pcbc", "dc", "one-hot", SCRIPTED)), a_run(setting=TINY_ONE_SHOT), a_run(preset=WATCHED)]
+RUNS += [a_run(setting=setting, preset=ENSEMBLE) for setting in (TINY, TINY_ONE_SHOT)]
 by_name = pytest.mark.parametrize("run", RUNS, ids=lambda run: f"{run.setting.name} {run.preset.name} {run.method}")
 
 
@@ -91,15 +88,11 @@ def test_finished_run_is_not_repeated(undisturbed, run, monkeypatch):
     assert not list((undisturbed / run.folder).glob("checkpoint*"))
 
 
-@pytest.mark.parametrize(
-    ("setting", "preset", "stop", "steps"),
-    [
-        (TINY_ONE_SHOT, PRESET, 46, 66),
-        (TINY, ENSEMBLE, 106, 126),
-        (TINY, WATCHED, 57, 61),
-        pytest.param(TINY_ONE_SHOT, ENSEMBLE, 106, 126, marks=pytest.mark.slow),
-    ],
-)
+STOPS = [(TINY_ONE_SHOT, PRESET, 46, 66), (TINY, ENSEMBLE, 106, 126), (TINY, WATCHED, 57, 61)]
+STOPS += [pytest.param(TINY_ONE_SHOT, ENSEMBLE, 106, 126, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize(("setting", "preset", "stop", "steps"), STOPS)
 def test_stopped_run_resumes_to_the_same_result(undisturbed, tmp_path, monkeypatch, setting, preset, stop, steps):
     run = a_run(setting=setting, preset=preset)
     count = stop_training(monkeypatch, setting, stop)
@@ -117,8 +110,48 @@ def test_every_recipe_loads_and_makes_its_policies(name):
         for member in (*preset.members, *preset.demonstrated):
             for method in ("pcbc", "dc"):
                 parts = member.of(method)
-                plans = parts.seen(lw.load_plans("MT10"))
-                actor = parts.actor(method, plans)
+                actor = parts.actor(method, parts.seen(lw.load_plans("MT10")))
                 assert (plans_of(actor) is None) == (method == "dc")
                 assert parts.transform(actor) is not None
         assert ImitationRun(SETTINGS[setting], "pcbc", 0, preset).describe(PLANS)["training"]
+
+
+TASKS = ("push", "reach", "window-open")
+MT10 = lw.load_plans("MT10")
+HUNDRED = lw.BehavioralCloningConfig(steps=100, batch_size=30, seed=5)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    root = tmp_path_factory.mktemp("stacked") / "demos"
+    lw.collect_demonstrations(TASKS, episodes_per_task=2, root=root, max_steps=100, progress=False)
+    return root
+
+
+def replay(demos, kind):
+    swapped = [SwapUnmentioned(MT10, 0.5)] if kind == "focused plan" else []
+    turned = Compose(lw.QAFTransform(MT10), lw.RandomYaw(0.3), *swapped)
+    return lw.LanguageWorldExperienceReplay(demos, sampler=lw.TaskBalancedSampler(), transform=turned, after_success=20)
+
+
+def make(kind, seed):
+    """An actor without noise, whose draws one call for all actors does not make alike."""
+    torch.manual_seed(seed)
+    features, decoder = ObservationFeatures(), MLPDecoder(width=32)
+    if kind in ("description", "one-hot"):
+        return lw.modules.DescriptorConditionedActor(TASKS, condition=kind, features=features, decoder=decoder)
+    if kind == "focused plan":
+        features = Concat(features, FocusFeatures(MT10))
+    return lw.PlanConditionedActor(MT10, features=features, decoder=decoder)
+
+
+@pytest.mark.parametrize("kind", first_fast(["plan", "focused plan", "description", "one-hot"]))
+def test_losses_are_those_of_separate_trainings(demos, kind):
+    actors, replays = [make(kind, seed) for seed in range(3)], [replay(demos, kind) for _ in range(3)]
+    together = StackedBehavioralCloning(actors, replays, HUNDRED, progress=False)
+    losses = torch.stack([together.step() for _ in range(HUNDRED.steps)])
+    assert losses[-10:].mean() < losses[:10].mean() / 2
+    for number in range(3):
+        config = lw.BehavioralCloningConfig(**{**vars(HUNDRED), "seed": HUNDRED.seed + number})
+        alone = lw.BehavioralCloningTrainer(make(kind, number), replay(demos, kind), config, progress=False)
+        assert (losses[:, number] - torch.tensor([alone.step() for _ in range(HUNDRED.steps)])).abs().max() < 1e-5

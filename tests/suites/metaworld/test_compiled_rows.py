@@ -130,10 +130,8 @@ def test_error_of_mujoco_is_caught_in_its_row(threads):
         stable = compiled.simulate(np.array([0, 1, 2]), np.ones((3, 3)), outputs, pool.run)
         assert stable.tolist() == [True, False, True]
     assert np.array_equal(outputs[0], rows[0].data.qpos)
-    assert rows[0].data.time == pytest.approx(0.4)
-    assert rows[0].data.mocap_pos.tolist() == [[1.0, 1.0, 1.0]]
-    assert rows[3].data.time == 0.0
-    assert find_handler() == handler
+    assert (rows[0].data.time, rows[0].data.mocap_pos.tolist()) == (pytest.approx(0.4), [[1.0, 1.0, 1.0]])
+    assert (rows[3].data.time, find_handler()) == (0.0, handler)
     with pytest.raises(mujoco.FatalError):
         mujoco.mj_step(rows[1].model, rows[1].data)
 
@@ -153,8 +151,7 @@ def test_error_of_mujoco_is_a_fault_until_the_reset(make, threads):
     memory, data.narena = data.narena, 4000
     for _ in range(3):
         expected, got = twin.step(action, everyone), engine.step(action, everyone)
-        assert got.fault.tolist() == [False, True, False]
-        assert {row for row, _ in differences(expected, got)} == {1}
+        assert (got.fault.tolist(), {row for row, _ in differences(expected, got)}) == ([False, True, False], {1})
         assert np.array_equal(got.observation[1], first)
     data.narena = memory
     assert same_bits(engine.reset([1], [5]), twin.reset([1], [5])).all()
@@ -264,8 +261,7 @@ def test_engine_warns_once_and_simulates_in_python_threads(change, reason, monke
     try:
         with pytest.warns(UserWarning, match=f"Python threads.*{reason}.*NUMBA_CACHE_DIR") as caught:
             engines = [VectorizedEngine(["reach"], num_threads=1) for _ in range(2)]
-        assert [engine._compiled for engine in engines] == [None, None]
-        assert len(caught) == 1
+        assert ([engine._compiled for engine in engines], len(caught)) == ([None, None], 1)
         assert same_bits(play(engines[0], ["reach"], 3)[-1], expected).all()
     finally:
         find_row_kernel.cache_clear()

@@ -220,6 +220,5 @@ def test_square_is_that_of_pow():
 
 def test_table_has_a_reward_for_every_task_and_uses_every_formula():
     table = reward_table()
-    assert list(table) == TASKS
-    assert {reward.formula for reward in table.values()} == set(FORMULAS)
+    assert (list(table), {reward.formula for reward in table.values()}) == (TASKS, set(FORMULAS))
     assert {reward.lift for reward in table.values()} - {None} == set(LIFTS)

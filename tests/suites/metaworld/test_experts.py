@@ -34,9 +34,8 @@ def test_actions_are_those_of_each_tasks_script_clipped(states):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         rows = states["observation"].double().numpy()
-        scripts = [
-            [ENV_POLICY_MAP[f"{task}-v3"]().get_action(now) for now in rows[k]] for k, task in enumerate(lw.MT50)
-        ]
+        policies = [ENV_POLICY_MAP[f"{task}-v3"]() for task in lw.MT50]
+        scripts = [[policy.get_action(now) for now in rows[k]] for k, policy in enumerate(policies)]
     expected = torch.from_numpy(np.clip(np.array(scripts, np.float64), -1, 1).astype(np.float32))
     assert torch.equal(actions["action"], expected)
     assert (expected.abs() == 1).any(-1).sum() > 100
@@ -44,9 +43,7 @@ def test_actions_are_those_of_each_tasks_script_clipped(states):
     assert actions["unclipped_action"].abs().max() > 1
 
 
-@pytest.mark.parametrize(
-    "index", [(3, 5), (slice(None), 0), (slice(0, 1), 2), (slice(4, 9), slice(1, 3)), (7,)], ids=str
-)
+@pytest.mark.parametrize("index", [(3, 5), (slice(None), 0), (slice(0, 1), 2), (slice(4, 9), slice(1, 3)), 7], ids=str)
 def test_batches_have_any_shape_and_rows_do_not_affect_each_other(states, index):
     expert = lw.ExpertActor("MT50")
     whole = expert(states.clone())["action"]
