@@ -79,7 +79,6 @@ def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Forks]:
 @pytest.fixture(scope="session")
 def python() -> Callable[..., subprocess.CompletedProcess[str]]:
     """Run a program in a new Python process."""
-
     return partial(python_process, "-c", timeout=120)
 
 

@@ -1,8 +1,4 @@
-"""Commands of ``lw-torchrl`` in separate processes that start at once.
-
-Each is a fork of one process that has imported the package and compiled the models of all tasks. Files and signals are
-those of any process; only the ten seconds of starting are saved.
-"""
+"""Commands of ``lw-torchrl`` in separate processes: forks of one that has imported the package, which takes 10 s."""
 
 import json
 import os
@@ -18,7 +14,6 @@ import json, os, sys, traceback
 import lw_torchrl as lw
 import lw_torchrl.evaluation, lw_torchrl.record.rollouts, matplotlib.figure
 from lw_torchrl.cli.main import main
-
 lw.LanguageWorldEnv("MT50", num_threads=1).close()
 print(0, flush=True)
 for line in sys.stdin:
@@ -57,13 +52,9 @@ class Forks:
 
     def __init__(self, folder: Path) -> None:
         self.outputs = folder / "out", folder / "err"
-        self.parent = subprocess.Popen(
-            [sys.executable, "-W", "ignore", "-c", PARENT],
-            env=os.environ | {"OMP_NUM_THREADS": "1"},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            bufsize=0,
-        )
+        command, environment = [sys.executable, "-W", "ignore", "-c", PARENT], os.environ | {"OMP_NUM_THREADS": "1"}
+        pipes = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
+        self.parent = subprocess.Popen(command, env=environment, bufsize=0, **pipes)
         self.child = self._number()  # 0: no child yet
 
     def _number(self) -> int:

@@ -1,11 +1,15 @@
-"""What a user writes, with three mistakes: mypy --strict finds them outside the checkout (test_packaging.py)."""
+"""What a user writes, with six mistakes: mypy --strict finds them outside the checkout (test_packaging.py)."""
 
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor, nn
 from torchrl.envs import TransformedEnv  # type: ignore[import-untyped]
 
 import lw_torchrl as lw
+from lw_torchrl.language.relations import RELATIONS, Comparison
+from lw_torchrl.modules import METHODS, Features, SkillEncoder
 
 TASKS = ["drawer-open", "reach"]
 PLANS = lw.load_plans("MT10")
@@ -35,3 +39,35 @@ print(f"{result.mean_sucess:.2f}", ask("reach", "the gripper is open"))  # plant
 env = TransformedEnv(lw.LanguageWorldEnv(TASKS, seed=1), lw.modules.transform_of(actor))
 print(env.rollout(20, actor.eval())["skill_weights"].shape)
 lw.save_actor(actor, "runs/actor.safetensors")
+
+
+def small(plans: lw.Plans) -> lw.PlanConditionedActor:
+    return lw.PlanConditionedActor(plans, skill_encoder=SkillEncoder(64))
+
+
+class Flat(lw.QueryEvaluator):
+    def logits(self, observation: Tensor, task_id: Tensor) -> Tensor:
+        return torch.zeros(*task_id.shape, self.plans.num_steps)
+
+
+class Hand(Features):
+    width = 3
+
+    def compute(self, tensordict: Any) -> Tensor:
+        hand: Tensor = tensordict["observation"][..., :3]
+        return hand
+
+
+class Texts(Features):
+    def compute(self, tensordict: Any) -> list[str]:  # planted
+        return ["near"]
+
+
+METHODS["small"] = small
+METHODS["words"] = "my_module:words"
+METHODS["linear"] = 64  # planted
+RELATIONS["far from"] = (Comparison("xyz", ">", 0.3),)
+RELATIONS["near to"] = Comparison("xyz", "<", 0.3)  # planted
+features = Hand(0.05, ["observation"])
+actor = lw.PlanConditionedActor(PLANS, skill_encoder=SkillEncoder(64), features=features, decoder=nn.Identity())
+evaluator = Flat(PLANS)

@@ -110,7 +110,6 @@ def test_truth_writes_a_table_and_a_figure_and_resumes(tmp_path, monkeypatch, ca
     assert [row.split("|")[1].strip() for row in rows] == ["exact", "every 4 steps", "50% flipped"]
     assert (tmp_path / "truth.png").stat().st_size > 10_000
     assert table in capsys.readouterr().out
-
     monkeypatch.setattr(truth.lw, "evaluate", None)  # results are read, not computed again
     truth.main(args)
     assert (tmp_path / "table.md").read_text("utf-8") == table

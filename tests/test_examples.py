@@ -8,10 +8,10 @@ import shlex
 import shutil
 import sys
 import tempfile
-import tomllib
 from pathlib import Path
 
 import pytest
+from cases import read_cases
 from commands import python_process
 from rerun.chunk import RrdReader
 
@@ -26,6 +26,9 @@ EXAMPLES = ROOT / "examples"
 TOUR = EXAMPLES / "tour.ipynb"
 PARTS = sorted((EXAMPLES / "parts").glob("*.py"))
 EXTENDING = sorted((EXAMPLES / "extending").glob("my_*.py"))
+RUNS = read_cases("examples.toml")
+PRINTS, SAYS = RUNS.pop("parts"), RUNS.pop("extending")
+TABLES = (METHODS, RELATIONS, SUITES, lw.PLAN_FORMATS)
 
 
 def names(path):
@@ -43,10 +46,6 @@ def run(folder, *command):
     assert "Traceback" not in done.stderr
     assert "Warning" not in done.stderr.replace("UserWarning: \x1b", "")  # Gymnasium's, about Meta-World's spaces
     return done.stdout
-
-
-RUNS = tomllib.loads((Path(__file__).parent / "examples.toml").read_text("utf-8"))
-PRINTS, SAYS = RUNS.pop("parts"), RUNS.pop("extending")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "train_bc.py" else pytest.mark.slow) for n in RUNS])
@@ -107,9 +106,6 @@ def test_tour_runs_from_top_to_bottom(tmp_path):
     assert outputs(tmp_path / "shown.ipynb")[0] == outputs(TOUR)[0]
 
 
-# ---- examples/parts: each program uses one part of the library
-
-
 def statements(path):
     """Return the statements of a program, without its docstring."""
     return ast.parse(path.read_text("utf-8")).body[1:]
@@ -130,11 +126,6 @@ def test_programs_have_at_most_15_lines_use_public_names_and_run(path, tmp_path,
         loads = [text for text in map(ast.unparse, statements(path)) if "save_actor(" not in text]
         assert len(loads) == len(statements(path)) - 1
         assert PRINTS[path.stem] in run(tmp_path, "-c", "\n".join(loads))
-
-
-# ---- examples/extending: the pages link to them and show their commands
-
-TABLES = (METHODS, RELATIONS, SUITES, lw.PLAN_FORMATS)
 
 
 def commands(path):

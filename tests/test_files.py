@@ -13,18 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from lw_torchrl._util import files as _files
-from lw_torchrl._util.files import (
-    LimitError,
-    locked,
-    read_json,
-    read_text,
-    read_toml,
-    replacing,
-    replacing_folder,
-    run_limited,
-    write_json,
-    write_text,
-)
+from lw_torchrl._util.files import locked, read_json, read_text, replacing, replacing_folder, write_json, write_text
 from lw_torchrl._util.tensor_files import read_tensors
 
 
@@ -34,9 +23,6 @@ class OwnError(ValueError):
 
 def names(folder):
     return sorted(path.name for path in folder.iterdir())
-
-
-# ---- whole files
 
 
 def test_content_is_synced_before_the_rename(tmp_path, monkeypatch):
@@ -78,12 +64,10 @@ def test_error_leaves_only_the_old_file(tmp_path):
 
 KILLED = """
 import importlib.util, os, signal, sys
-
 stop, target = int(sys.argv[1]), sys.argv[2]
 spec = importlib.util.spec_from_file_location("_files", sys.argv[3])  # the package would take seconds to import
 _files = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(_files)
-
 def counting(module, name):
     real = getattr(module, name)
     def call(*args, **kwargs):
@@ -93,7 +77,6 @@ def counting(module, name):
         stop -= 1
         return real(*args, **kwargs)
     setattr(module, name, call)
-
 for name in ("open", "fsync", "close", "replace"):
     counting(os, name)
 import pathlib
@@ -125,9 +108,6 @@ def test_threads_that_write_one_file_leave_a_whole_one(tmp_path):
             future.result()
             assert target.read_text() in texts
     assert names(tmp_path) == ["a.txt"]
-
-
-# ---- what stands at the name
 
 
 def test_a_link_and_a_mode_are_kept(tmp_path):
@@ -194,9 +174,6 @@ def test_folder_appears_whole_or_not_at_all(tmp_path):
     assert names(tmp_path) == ["out"]
 
 
-# ---- locks
-
-
 @pytest.mark.parametrize("folder", [False, True])
 def test_second_writer_raises_or_waits(tmp_path, holding, folder):
     place = tmp_path / "runs" / "mine.txt"
@@ -235,9 +212,6 @@ def test_waiting_threads_enter_one_at_a_time(tmp_path):
     assert names(tmp_path) == []
 
 
-# ---- reading
-
-
 def test_text_has_plain_line_ends_and_no_byte_order_mark(tmp_path):
     (tmp_path / "a.txt").write_bytes("\ufeffä\r\nb\rc\n".encode())
     assert read_text(tmp_path / "a.txt", OwnError) == "ä\nb\nc\n"
@@ -254,7 +228,7 @@ def test_text_has_plain_line_ends_and_no_byte_order_mark(tmp_path):
 def test_toml_errors_name_the_file(tmp_path, text):
     (tmp_path / "tasks.toml").write_text(text)
     with pytest.raises(OwnError, match=r"tasks\.toml: "):
-        read_toml(tmp_path / "tasks.toml", OwnError)
+        _files.read_toml(tmp_path / "tasks.toml", OwnError)
 
 
 BAD = {
@@ -295,14 +269,11 @@ def test_json_that_is_nested_deeply_is_invalid_also_in_a_policy(tmp_path, depth)
         read_tensors(tmp_path / "a.safetensors")
 
 
-# ---- limits
-
-
 def test_a_program_is_limited_in_time_and_memory(monkeypatch):
-    done = run_limited([sys.executable, "-c", "import sys; print('read'); sys.exit('odd')"], 10)
+    done = _files.run_limited([sys.executable, "-c", "import sys; print('read'); sys.exit('odd')"], 10)
     assert (done.returncode, done.stdout, done.stderr) == (1, b"read\n", b"odd\n")
     if sys.platform == "linux":
-        assert b"MemoryError" in run_limited([sys.executable, "-c", "bytes(10**9)"], 10).stderr
+        assert b"MemoryError" in _files.run_limited([sys.executable, "-c", "bytes(10**9)"], 10).stderr
     monkeypatch.setattr(_files, "_SECONDS", 1)
-    with pytest.raises(LimitError, match="limits of 1 s"):
-        run_limited([sys.executable, "-c", "while True: pass"], 10)
+    with pytest.raises(_files.LimitError, match="limits of 1 s"):
+        _files.run_limited([sys.executable, "-c", "while True: pass"], 10)

@@ -21,19 +21,13 @@ class WithoutOpenGL(MetaPathFinder):
             raise AttributeError("'NoneType' object has no attribute 'glGetError'")
 
 
-@pytest.mark.parametrize(
-    ("backend", "error", "message"),
-    [
-        ("osmesa", ImportError, "MUJOCO_GL is 'osmesa'.*libosmesa6.*unset MUJOCO_GL"),
-        ("EGL", ImportError, "MUJOCO_GL is 'egl'.*libegl1.*unset MUJOCO_GL"),
-        ("", AttributeError, "glGetError"),
-    ],
-)
-def test_error_names_a_missing_rendering_library(monkeypatch, backend, error, message):
+@pytest.mark.parametrize(("backend", "library"), [("osmesa", "libosmesa6"), ("EGL", "libegl1"), ("", "")])
+def test_error_names_a_missing_rendering_library(monkeypatch, backend, library):
     monkeypatch.setenv("MUJOCO_GL", backend)
     monkeypatch.delitem(sys.modules, "metaworld", raising=False)
     monkeypatch.setattr(sys, "meta_path", [WithoutOpenGL(), *sys.meta_path])
-    with pytest.raises(error, match=message):
+    message = f"MUJOCO_GL is '{backend.lower()}'.*{library}.*unset MUJOCO_GL" if backend else "glGetError"
+    with pytest.raises(ImportError if backend else AttributeError, match=message):
         import_metaworld()
 
 
@@ -41,12 +35,10 @@ EVERY_ROOM = """
 import pkgutil, sys
 from importlib import import_module
 import lw_torchrl
-
 class Failing:
     def find_spec(self, fullname, path, target=None):
         if fullname == "torchrl":
             raise AttributeError("'NoneType' object has no attribute 'glGetError'")
-
 sys.meta_path.insert(0, Failing())
 for module in pkgutil.iter_modules(lw_torchrl.__path__):
     if module.ispkg and module.name[0] != "_":

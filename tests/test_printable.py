@@ -6,6 +6,7 @@ import re
 from contextlib import suppress
 
 import pytest
+from cases import read_cases
 from commands import python_process
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -16,6 +17,7 @@ from lw_torchrl.cli.main import main
 
 # Sequences that clear the screen, set the title, write to the clipboard, move the cursor or reverse the text.
 SEQUENCES = "\x1b[2J \x1b]0;owned\x07 \x1b]52;c;eA==\x1b\\ \r \x08\x08 \x9b1A \u202e \u2066 \x7f"
+EVIL = "\x1b]0;owned\x07\x1b[2J"
 
 
 @given(st.text())
@@ -32,15 +34,7 @@ def test_usual_text_is_unchanged(text):
     assert printable(text) == text
 
 
-LINKS = [
-    "[click](//evil.example/x)", "![x](http://evil.example/x.png)", "<img src=//evil.example>", "https://evil.example",
-    "www.evil.example", "<https://evil.example>", "[a]: //evil.example\n[a]", "me@evil.example",
-    "mailto:me@evil.example",
-    "`x` ![y][z]", "a | b\n|---|---|\n| c | d |", "\\[x](//evil.example)", "&#91;x](//evil.example)", "\n# heading",
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("text", LINKS)
+@pytest.mark.parametrize("text", read_cases("links.toml")["links"])
 @pytest.mark.parametrize("around", ["{}", "**→ {}**", "| {} | b |", "- x {}"])
 def test_markdown_has_no_links_or_images(text, around):
     markdown_it = pytest.importorskip("markdown_it")
@@ -56,9 +50,6 @@ def test_markdown_has_no_links_or_images(text, around):
 
 def run(*args, **variables):
     return python_process("-W", "ignore::DeprecationWarning", "-m", "lw_torchrl", *args, **variables)
-
-
-EVIL = "\x1b]0;owned\x07\x1b[2J"
 
 
 @pytest.mark.parametrize("command", [["plan", "read"], ["check"], ["plan", "read", "--json"]], ids=" ".join)

@@ -4,6 +4,7 @@ import copy
 import importlib
 import pickle
 import sys
+from pathlib import Path
 
 import pytest
 from tensordict.nn import TensorDictSequential
@@ -15,53 +16,16 @@ from lw_torchrl.language.relations import RELATIONS, STATES, Comparison
 from lw_torchrl.modules import METHODS, make_policy
 from lw_torchrl.suites import SUITES
 
-MODULE = """
-import torch
-import lw_torchrl as lw
-from dataclasses import replace
-from lw_torchrl.language.relations import Comparison
-from lw_torchrl.modules import MLPDecoder
-
-def make(plans, width=8):
-    return lw.PlanConditionedActor(plans, decoder=MLPDecoder(width=width))
-
-class Guess(lw.QueryEvaluator):
-    def logits(self, observation, task_id):
-        return torch.zeros(*task_id.shape, self.plans.num_steps)
-
-FAR = (Comparison("xyz", ">", 0.3),)
-LOUD = replace(lw.PLAN_FORMATS["basic_py"], extension="txt")
-
-def make_suite():
-    return replace(lw.suites.load_suite("metaworld"), name="metaworld")
-"""
-POINTS = """
-[lw_torchrl.methods]
-mine = my_plugin:make
-broken = no_such_module:broken
-uncallable = my_plugin:FAR
-[lw_torchrl.relations]
-far from = my_plugin:FAR
-[lw_torchrl.formats]
-loud = my_plugin:LOUD
-[lw_torchrl.suites]
-again = my_plugin:make_suite
-"""
 REGISTRIES = (RELATIONS, STATES, lw.PLAN_FORMATS, SUITES, METHODS)
 
 
 @pytest.fixture
-def plugin(tmp_path, monkeypatch):
+def plugin(monkeypatch):
     """A package that is installed while a test runs."""
-    (tmp_path / "my_plugin.py").write_text(MODULE)
-    info = tmp_path / "my_plugin-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-plugin\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(POINTS)
-    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.syspath_prepend(str(Path(__file__).with_name("plugin")))
     before = [dict(registry.data) for registry in REGISTRIES]
     _registry.entry_points_of.cache_clear()
-    yield tmp_path
+    yield
     sys.modules.pop("my_plugin", None)
     _registry.entry_points_of.cache_clear()
     for registry, entries in zip(REGISTRIES, before, strict=True):

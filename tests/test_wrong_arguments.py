@@ -20,11 +20,10 @@ PUBLIC |= {name: getattr(module, name) for module in MODULES for name in module.
 PUBLIC |= {one.__name__: one for one in (lw.language.plans.PlanStep, lw.language.tasks.resolve_tasks)}
 PUBLIC |= {name: getattr(lw.language.nearest, name) for name in ("nearest_query", "nearest_skill")}
 # The library makes results; a plan checks the types of its steps.
-NOT_MADE_BY_USERS = {
-    *["DecodedPlan", "DecodedStep", "EvaluationResult", "Planner", "PlannerError", "PlanError", "QueryError"]
-}
+NOT_MADE = {"DecodedPlan", "DecodedStep", "EvaluationResult", "Planner", "PlannerError", "PlanError", "QueryError"}
 ALSO_NAMED = {"names": ["tasks?"]}
 NAMESPACE = {name: value for module in MODULES for name, value in vars(module).items()} | PUBLIC
+NAMES = sorted(name for name in {*PUBLIC} - NOT_MADE if callable(PUBLIC[name]))
 
 
 def function_of(name):
@@ -60,7 +59,6 @@ def calls(folder):
     return good_calls(folder)
 
 
-NAMES = sorted(name for name in {*PUBLIC} - NOT_MADE_BY_USERS if callable(PUBLIC[name]))
 CASES = [(name, argument) for name in NAMES for argument in arguments_of(name)]
 CASES.remove(("resolve_tasks", "tasks"))  # tables, which callers check
 

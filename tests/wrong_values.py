@@ -6,10 +6,12 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
+from cases import read_cases
 
 import lw_torchrl as lw
 
 PLAN = lw.load_plans("MT10")["reach"]
+CONSTANTS = read_cases("wrong_values.toml")
 # Of these, the values that an argument's annotation does not allow must raise an error that names the argument.
 OF_ANY_TYPE: list[Any] = [
     *(3, 0, -1, 1.5, -0.1, 1.1, math.nan, math.inf, True, None, "", "no such", "0.1", b"bytes", object()),
@@ -17,50 +19,14 @@ OF_ANY_TYPE: list[Any] = [
     *({}, {"one": 3}, {3: "one"}, {"reach": "a plan"}, torch.zeros(3), torch.zeros(1, 1, dtype=torch.bool)),
 ]
 # Values that the annotation allows and the function must refuse, by the argument's name or the function's and its own.
-OF_ONE_NAME: dict[str, list[Any]] = {
+OF_ONE_NAME: dict[str, list[Any]] = CONSTANTS["wrong"] | {
     "plans": [{}, {"push": PLAN}],
     "reference": [{}, {"push": PLAN}],
     "Plans.plans": [3, "reach", [], {}, [3], {"push": PLAN}, [PLAN, PLAN]],
-    "RandomYaw.plans": [],
-    "RolloutRecorder.plans": [],
-    "OpenAIPlanner.plans": [{}],
-    "log_rollout.tasks": [],
-    "tasks": ["reech", ["reech"], [], ["reach", "reach"]],
-    "names": ["reech", ["reech"], [], [3], ["reach", "reach"]],
-    "ImageQueryEvaluator.names": [],  # those that a plan names must be among them
-    "task": ["reech"],
-    "RolloutRecorder.task": [],  # the name of any task
-    "in_keys": [["one", "one"], []],
-    "out_keys": [["one", "one"], []],
-    "keys": ["all"],
-    "evaluator": [3, "one", []],
-    "loss": [3, "one", []],
-    "config": [3, "one", []],
-    "device": ["gpu", "cuda:99"],
-    "cameras": ["corner9", ["corner", "nose"], [], ["corner", "corner"]],
-    "engine": ["mujoco", 3, []],
-    "suite": ["mujoco"],
-    "height": [0, -1, 10**6],
-    "width": [0, -1],
-    "every": [0, -1],
-    "members": [[]],
-    "predicates": [["no such"]],
-    "queries": [{}, {"reech": []}, {"reach": ["no query"]}],
-    "episodes": [-1, 99, {"push": 1}, {"reach": [9]}, {}],
-    "noise_scale": [-1.0, [], math.inf],
     "worker": [(2, 1), (0, 0)],
-    "rows": [[-1]],
-    "target_fraction": [-0.1, 1.5],
-    "root": [[]],
 }
-
-
-# Public names that can be called with nothing but plans, or without arguments.
+# Public names that can be called with nothing but plans.
 PLANS_ONLY = ("CorruptQAF", "PlanConditionedActor", "Plans", "QAFTransform", "QueryEvaluator", "ScriptedSkillActor")
-NO_ARGUMENTS = (
-    "CameraTransform", "EpisodeFilter", "ImageQueryEvaluatorConfig", "QueryEvaluatorConfig", "TaskBalancedSampler",
-    "load_skills",
-)  # fmt: skip
 
 
 def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
@@ -96,31 +62,25 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
     names = ("ImageQueryEvaluator", "PlanConditionedQValue", "PlanConditionedValue", "StateQueryEvaluator")
     return {
         **{name: {"plans": plans} for name in PLANS_ONLY},
-        **{name: {} for name in NO_ARGUMENTS},
         **dict.fromkeys(names, wide),
+        **CONSTANTS["good calls"],
         "ActorEnsemble": {"members": [actor]},
         "AdvantageWeightedLoss": {"actor_network": actor},
         "BehavioralCloningTrainer": {"actor": actor, "replay": replay, "progress": False},
-        "CoLearningSampler": {"target": "reach"},
         "ConditionalPlan": {"task": "reach", "steps": PLAN.steps},
         "DemonstratedSACLoss": {"actor_network": actor.stochastic(), "qvalue_network": qvalue},
         "DemonstratedTD3Loss": {"actor_network": actor, "qvalue_network": qvalue},
-        "DescriptorConditionedActor": {"tasks": "reach"},
         "ExpectileValueLoss": {"value_network": value},
-        "ExpertActor": {"tasks": "reach"},
         "ImageQueryEvaluatorTrainer": {"data": data, **eyes},
         "JitterTarget": {"plans": lw.canonical_plans(plans), "std": 0.03},
         "LabelledQueries": {"replay": replay, "config": config},
-        "LanguageWorldEnv": {"tasks": "reach"},
         "LanguageWorldExperienceReplay": {"root": root, "label": "executed"},
         "OfflineTrainer": {"loss": lw.objectives.ExpectileValueLoss(value), "replay": executed, "progress": False},
-        "OpenAIPlanner": {"model": "none", "base_url": "http://localhost:1"},
         "QValue": {"trunk": actor.trunk, "width": 8},
         "Value": {"trunk": actor.trunk, "width": 8},
         "PlanStep": {"condition": PLAN.steps[0].condition, "skill": PLAN.steps[0].skill},
         "QueryEvaluatorTrainer": {"evaluator": evaluator, "data": data, "progress": False},
         "QueryProgram": {"queries": {"reach": ["the robot's gripper is open"]}},
-        "RandomYaw": {"scale": 0.1},
         "RolloutRecorder": {"logger": logger},
         "SwapUnmentioned": {"plans": plans, "probability": 0.5},
         "Task": {"name": "stack", "description": "stack it", "objects": lw.TASKS["reach"].objects},
@@ -139,19 +99,12 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "load_evaluator": {"path": folder / "asked.safetensors", "plans": plans},
         "load_demonstrations": {"root": root},
         "load_pictures": {"replay": replay},
-        "load_plans": {"source": "MT10"},
         "log_rollout": {"logger": logger, "rollout": rollout},
-        "nearest_query": {"text": "the gripper is open", "task": "reach"},
-        "nearest_skill": {"text": "reach"},
-        "parse_query": {"text": "the robot's gripper is open", "task": "reach"},
-        "plan_prompt": {"task": "reach", "format": "basic_py"},
         "plot_success": {"result": result},
-        "resolve_tasks": {"names": "reach"},
         "save_actor": {"actor": actor, "path": folder / "none.safetensors"},
         "save_evaluator": {"evaluator": evaluator, "path": folder / "none.safetensors"},
         "save_plans": {"plans": plans, "folder": folder / "none"},
         "standardize_by_task": {"advantage": torch.zeros(2, 1), "task_id": torch.zeros(2).long()},
-        "supported_queries": {"task": "reach"},
     }
 
 

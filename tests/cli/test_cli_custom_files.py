@@ -3,29 +3,11 @@
 import json
 
 import pytest
+from cases import read_cases
 from commands import fails, run
 
 import lw_torchrl as lw
 
-TASKS = """
-[reach]
-description = "Bring the hand to the ball."
-objects.ball = "obs[36:39]"
-"""
-PLAN = """
-def reach(robot):
-    if check("the gripper is not near the ball"):
-        robot.go("to the ball")
-    if check("the gripper is near the ball"):
-        robot.wait("at the ball")
-"""
-SKILLS = """
-["go to the ball"]
-target = "ball"
-["wait at the ball"]
-target = "ball"
-gain = 0.0
-"""
 ENCODER = """
 import torch
 def encode(texts):
@@ -40,10 +22,8 @@ TINY = ("--steps", 5, "--width", 8, "--depth", 1)
 def own(tmp_path_factory):
     """Return a folder with custom files."""
     folder = tmp_path_factory.mktemp("own")
-    (folder / "tasks.toml").write_text(TASKS)
-    (folder / "reach.plan").write_text(PLAN)
-    (folder / "skills.toml").write_text(SKILLS)
-    (folder / "my_texts.py").write_text(ENCODER)
+    for name, text in {**read_cases("cli/texts.toml")["custom"], "my_texts.py": ENCODER}.items():
+        (folder / name).write_text(text)
     short = {"episodes_per_task": 1, "max_steps": 30, "progress": False}
     lw.collect_demonstrations(["push", "reach"], root=folder / "demos", **short)
     return folder

@@ -5,18 +5,12 @@ import re
 import sys
 
 import pytest
+from cases import read_cases
 from commands import document, fails, run
 
 import lw_torchrl as lw
 
-PLAN = """# push: anything
-def push(robot):
-    # Far away.
-    if check("the gripper is not near the puck"):
-        robot.place("the gripper above the puck")
-    if check("the gripper is near the puck"):
-        robot.shove("the puck over there")
-"""
+PLAN = read_cases("cli/texts.toml")["push"]
 
 
 def test_tasks_are_listed(capsys, monkeypatch):

@@ -4,15 +4,15 @@ import json
 import re
 import subprocess
 import sys
-import tomllib
 from importlib.metadata import entry_points
-from pathlib import Path
 
 import pytest
+from cases import read_cases
 from commands import fails, run
 
 import lw_torchrl
 import lw_torchrl.cli.main as cli
+from lw_torchrl.cli import machine
 from lw_torchrl.cli.main import COMMANDS, main
 
 
@@ -59,10 +59,7 @@ print([name for name in ("torch", "torchrl", "mujoco", "rich") if name in sys.mo
     assert python(program).stdout.splitlines()[-1] == "[]"
 
 
-ERRORS = tomllib.loads((Path(__file__).parent / "errors.toml").read_text("utf-8"))["cases"]
-
-
-@pytest.mark.parametrize(("command", "message"), ERRORS)
+@pytest.mark.parametrize(("command", "message"), read_cases("cli/errors.toml")["cases"])
 def test_an_error_is_one_line_and_status_2(capsys, tmp_path, monkeypatch, command, message):
     monkeypatch.chdir(tmp_path)
     error = fails(capsys, *command.split())
@@ -77,9 +74,7 @@ def test_an_unknown_option_is_an_error_with_the_nearest_name(capsys):
     assert "--episodes INT" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("error", "status"), [(KeyboardInterrupt(), 130), (ValueError("no"), 2), (KeyError("x"), None)]
-)
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, 130), (ValueError, 2), (KeyError, None)])
 def test_exit_status_depends_on_the_error(capsys, monkeypatch, error, status):
     def failing(args):
         raise error
@@ -89,7 +84,7 @@ def test_exit_status_depends_on_the_error(capsys, monkeypatch, error, status):
         main([])
     assert status is None or caught.value.code == status
     monkeypatch.setenv("LW_TORCHRL_TRACEBACK", "1")
-    with pytest.raises(SystemExit if status == 130 else type(error)):
+    with pytest.raises(SystemExit if status == 130 else error):
         main([])
 
 
@@ -109,3 +104,28 @@ def test_import_runs_a_module_first(capsys, tmp_path, monkeypatch):
     sys.modules.pop("my_words")
     main(["--import=my_words", "tasks", "reach", "--json"])
     assert json.loads(capsys.readouterr().out.removeprefix("imported\n"))["task"]["task"] == "reach"
+
+
+def test_info_reports_versions_extras_folders_and_slow_parts(capsys):
+    printed = run(capsys, "info")
+    titles = ("versions", "machine", "extras", "cache folders", "variables", "slow here")
+    assert [line[:-1] for line in printed.splitlines() if line.endswith(":") and line[0] != " "] == [*titles]
+    assert lw_torchrl.__version__ in printed
+    document = json.loads(run(capsys, "info", "--json"))
+    assert [*document] == ["versions", "machine", "extras", "cache_folders", "variables", "slow"]
+    assert document["versions"]["torch"].startswith("2.")
+    assert {"fast", "text", "ray"} <= {*document["extras"]}
+
+
+def test_missing_packages_of_an_extra_are_named(monkeypatch):
+    lines = ['numba>=0.61; extra == "fast"', 'not-a-package; extra == "odd"']
+    monkeypatch.setattr(machine, "requires", lambda _: lines)
+    assert machine.find_extras() == {"fast": [], "odd": ["not-a-package"]}
+
+
+def test_slow_parts_are_explained(monkeypatch):
+    monkeypatch.setattr(machine, "find_kernel", lambda: None)
+    monkeypatch.setattr(machine, "available_cores", lambda: 1)
+    monkeypatch.setattr(machine.os, "getloadavg", lambda: (50.0, 0.0, 0.0))
+    reasons = " ".join(machine.find_slow_parts())
+    assert all(text in reasons for text in ("NUMBA_CACHE_DIR", "only one core", "the load is 50.0"))

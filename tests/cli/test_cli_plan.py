@@ -3,10 +3,13 @@
 import re
 
 import pytest
+from cases import read_cases
 from commands import document, fails, run
 from fake_server import FakeServer, asked_for, completion, error, serving, shipped
 
 import lw_torchrl as lw
+
+TEXTS = read_cases("cli/texts.toml")
 
 
 def test_prompt_equals_that_of_plan_prompt(capsys):
@@ -29,33 +32,12 @@ def test_a_plan_in_own_words_can_be_scripted(capsys, tmp_path):
     assert near in run(capsys, *evaluate, tmp_path / "scripts")
 
 
-PROGRAM = """def push(robot):
-    attempts += 1
-    if check("the gripper is near the puck"):
-        if check("the gripper is closed"):
-            robot.push("the puck to the target location")
-        else:
-            robot.close("the gripper")
-    elif check("the puck is happy \x1b[31m and blue"):
-        robot.dance("wildly")
-    else:
-        robot.move("above the puck")
-"""
-TREE = """if gripper near puck
-  if gripper closed
-    push the puck to the target location
-  else
-    close the gripper
-else
-  move above the puck"""
-
-
 def test_read_prints_the_tree_of_a_program(capsys, tmp_path):
     file = tmp_path / "push.py"
-    file.write_text(PROGRAM)
+    file.write_text(TEXTS["program"])
     printed = run(capsys, "plan", "read", file)
     tree = [re.split(r"(?<=\S) {2,}", line.rstrip())[0] for line in printed.splitlines()]
-    assert tree[2:9] == TREE.splitlines()
+    assert tree[2:9] == TEXTS["tree"].splitlines()
     assert "left out: 'dance wildly': no query is near enough" in printed
     assert "line 2: 'attempts += 1' is left out" in printed
     assert "\x1b" not in printed
@@ -69,12 +51,7 @@ def test_read_prints_the_tree_of_a_program(capsys, tmp_path):
 
 def test_plans_of_another_suite_are_read_and_checked(capsys, tmp_path):
     file = tmp_path / "mine.plan"
-    plan = """# fetch/push: Push the puck to the target location.
-def fetch__push(robot):
-    if check("the robot's gripper is not near the puck"):
-        robot.move("the gripper to the puck")
-"""
-    file.write_text(plan)
+    file.write_text(TEXTS["fetch"])
     assert "mine.plan: 1 step, valid" in run(capsys, "check", file)
     assert "fetch/push" in run(capsys, "plan", "read", file)
     read = {plan["task"] for plan in document(capsys, "plan read", "fetch")["plans"]}

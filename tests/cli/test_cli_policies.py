@@ -1,20 +1,25 @@
-"""``lw-torchrl train``, ``evaluate``, ``info`` and ``demo``: their output, files, and resuming."""
+"""``lw-torchrl train``, ``evaluate``, ``info``, ``demo`` and ``record``: their output, files, and resuming."""
 
 import json
+import re
 import signal
 import time
 from dataclasses import replace
 
 import pytest
+import torch
 from commands import document, fails, run
+from rerun.chunk import RrdReader
 
 import lw_torchrl as lw
 from lw_torchrl.cli.demo import QUICK
 from lw_torchrl.cli.evaluate import episodes_to_record
 from lw_torchrl.cli.main import main
+from lw_torchrl.record.tabs import Tabs
 
 TINY = ("--steps", "30", "--batch-size", "20", "--width", "16", "--depth", "1")
 SHORT = ("--episodes", 1, "--max-steps", 5)
+LONG = ("--max-steps", 120, "--seed", 1000)
 
 
 @pytest.fixture(scope="module")
@@ -139,9 +144,6 @@ def test_info_describes_policies_and_datasets(capsys, demos, policy):
     assert "behaviour  noisy" in run(capsys, "info", demos)
 
 
-# ---- demo
-
-
 def kill_when(forks, ready, timeout=120):
     deadline = time.monotonic() + timeout
     while not ready():
@@ -185,7 +187,6 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
     assert result.config["seed"] != config.demonstration_seed
     assert result.table() in printed
     assert f"lw-torchrl view {out / 'rollout.rrd'}" in printed
-
     policy = (out / "checkpoint.safetensors").read_bytes()
     kept = ["results.json", "config.json", "demonstrations/metadata.json", "demonstrations/data/action.memmap"]
     before = {name: (out / name).stat().st_mtime_ns for name in kept}
@@ -205,3 +206,73 @@ def test_two_processes_cannot_write_one_demo(capsys, tmp_path, holding):
     holding(tmp_path / "demo", folder=True)
     assert "another process is writing to" in fails(capsys, "demo", "--quick", "--out", tmp_path / "demo")
     assert [path.name for path in (tmp_path / "demo").iterdir()] == [".lock"]
+
+
+def tabs(recording):
+    return [tab.name for tab in Tabs.read(RrdReader(recording)).tabs()]
+
+
+def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
+    out = tmp_path / "recordings" / "reach.rrd"
+    printed = run(capsys, "record", "reach", "--episodes", 0, 2, *LONG, "--stop-at-success", "--out", out)
+    assert "reach, episode 0, expert: success at step " in printed
+    assert f"lw-torchrl view {out}" in printed
+    assert tabs(out) == ["overview", "reach-0", "reach-2"]
+    ended = [int(step) for step in re.findall(r"success at step (\d+)", printed)]
+    lengths = [row["steps"] for row in document(capsys, "info", out)["episodes"]]
+    assert lengths == ended, "episodes end at the success"
+
+
+@pytest.mark.parametrize("who", ["random", "wrong"])
+def test_a_random_policy_is_reproducible(capsys, tmp_path, who):
+    out = ("--out", tmp_path / "x.rrd")
+    documents = [document(capsys, "record", "push", "--policy", who, *LONG, *out) for _ in range(2)]
+    assert documents[0] == documents[1]
+    assert documents[0]["episodes"][0]["first_success"] is None
+
+
+def test_two_policies_are_shown_side_by_side(capsys, tmp_path):
+    policy, out = tmp_path / "mine.safetensors", tmp_path / "x.rrd"
+    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10")), policy)
+    printed = run(capsys, "record", "reach", "--policy", policy, "--compare", "scripted", *LONG, "--out", out)
+    assert "reach, episode 0, mine: failed" in printed
+    assert "reach, episode 0, scripted: success at step " in printed
+    assert tabs(out) == ["reach · episode 0 · side by side", "reach-0-1", "reach-0-2"]
+
+
+def test_the_cause_of_a_failure_is_printed(capsys, tmp_path):
+    options = ("--policy", "scripted", "--attribute", "--max-steps", 45, "--seed", 1000, "--out", tmp_path / "x.rrd")
+    assert "push, episode 0, scripted: failed, out of time: " in run(capsys, "record", "push", *options)
+
+
+OWN = """
+import torch
+import lw_torchrl as lw
+class Never(lw.QueryEvaluator):
+    def logits(self, observation, task_id):
+        return observation.new_full((*task_id.shape, self.plans.num_steps), -3.0)
+policy = lw.ScriptedSkillActor(lw.load_plans("MT10"))
+never = Never(lw.load_plans("MT10"))
+number = 3
+"""
+
+
+def test_custom_policies_and_evaluators_are_recorded(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_parts.py").write_text(OWN)
+    printed = run(capsys, "record", "reach", "--policy", "my_parts:policy", *LONG)
+    assert "reach, episode 0, policy: success at step " in printed
+    assert tabs(tmp_path / "runs" / "recordings" / "reach-policy.rrd") == ["reach-0"]
+    torch.manual_seed(0)
+    lw.training.save_evaluator(lw.modules.StateQueryEvaluator(lw.load_plans("MT10"), width=8), "evaluator.safetensors")
+    reach = lw.Plans({"reach": lw.load_plans("MT10")["reach"]})
+    lw.save_actor(lw.PlanConditionedActor(reach, decoder=lw.modules.MLPDecoder(width=8)), "mine.safetensors")
+    for policy in ("scripted", "mine.safetensors"):
+        for evaluator in ("evaluator.safetensors", "my_parts:never", "my_parts:Never"):
+            options = ("--policy", policy, "--evaluator", evaluator, "--max-steps", 20, "--out", "x.rrd")
+            assert "reach, episode 0" in run(capsys, "record", "reach", *options)
+    wrong = ("record", "reach", "--policy", "scripted", "--evaluator", "my_parts:number")
+    assert "--evaluator my_parts:number" in fails(capsys, *wrong)
+    assert "my_parts:number" in fails(capsys, "evaluate", "my_parts:number")
+    assert "must have the form my_module:name" in fails(capsys, "evaluate", "my_parts:nothing")
+    assert "requires a policy with plans" in fails(capsys, "record", "reach", "--evaluator", "my_parts:never")

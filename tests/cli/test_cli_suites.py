@@ -15,7 +15,6 @@ OWN = """
 from dataclasses import replace
 from lw_torchrl.suites import SUITES, load_suite
 from lw_torchrl.suites import suite as suite_module
-
 fetch = load_suite("fetch")
 reach = {"fetch/reach": replace(fetch.tasks["fetch/reach"], layout=replace(fetch.layout, reach=0.1))}
 slow = replace(fetch, layout=reach["fetch/reach"].layout, tasks=reach, plans=None)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from commands import document, fails, run
 from pictures import why_no_pictures
+from speed import first_fast
 
 import lw_torchrl as lw
 from lw_torchrl.cli.main import main
@@ -44,9 +45,7 @@ def trained(demos, tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize(
-    "loss", ["iql", *(pytest.param(loss, marks=pytest.mark.slow) for loss in ("advantage", "td3-bc", "cql"))]
-)
+@pytest.mark.parametrize("loss", first_fast(["iql", "advantage", "td3-bc", "cql"]))
 def test_an_offline_loss_trains_a_policy_and_resumes(capsys, noisy, tmp_path, loss):
     out = tmp_path / "policy.safetensors"
     args = ("train", noisy, "--out", out, "--loss", loss, *SMALL, *NET)

@@ -11,19 +11,9 @@ from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl._util.reproducibility import package_versions
-from lw_torchrl.data import collect_demonstrations
+from lw_torchrl.data import CollectConfig, Demonstrations, collect_demonstrations
 from lw_torchrl.data.collect import EpisodeFiles
-from lw_torchrl.data.dataset import (
-    COLUMNS,
-    DATA,
-    CollectConfig,
-    Demonstrations,
-    describe_episode,
-    load_rows,
-    read_metadata,
-    write_metadata,
-    write_rows,
-)
+from lw_torchrl.data.dataset import COLUMNS, describe_episode, load_rows, read_metadata, write_metadata, write_rows
 from lw_torchrl.language.tasks import task_id
 
 TASKS = ("push", "reach")
@@ -49,8 +39,7 @@ KINDS = {
 
 
 def open_replay(root, kind="expert", seed=0, **options):
-    generator = torch.Generator().manual_seed(seed)
-    defaults = dict(batch_size=8, generator=generator)
+    defaults = dict(batch_size=8, generator=torch.Generator().manual_seed(seed))
     return lw.LanguageWorldExperienceReplay(root, **{**defaults, **KINDS[kind], **options})
 
 
@@ -129,7 +118,7 @@ def random_dataset(root: Path, lengths: Sequence[Sequence[int]], seed: int = 0) 
             rows.update({"observation": states[:-1], "task_id": number, "next": after})
             parts.append((task, episode, rows))
     config = CollectConfig(tasks, len(lengths[0]), seed, max_steps=max(map(max, lengths)))
-    infos = write_rows(root / DATA, parts, config.layout)
+    infos = write_rows(root / "data", parts, config.layout)
     numbers_of, attempts = {task: task_id(task) for task in tasks}, dict.fromkeys(tasks, len(lengths[0]))
     write_metadata(Demonstrations(root, config, package_versions(), numbers_of, infos, attempts))
     return read_metadata(root)

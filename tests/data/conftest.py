@@ -21,3 +21,8 @@ def other_dataset(tmp_path_factory):
 @pytest.fixture(scope="session")
 def rows(dataset):
     return load_rows(dataset)
+
+
+@pytest.fixture
+def both(dataset, other_dataset):
+    return [dataset.root, other_dataset.root]

@@ -22,11 +22,6 @@ from lw_torchrl.modules.policy import with_plans
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.training.checkpoint import demonstrated_tasks, demonstration_seeds
 
-OTHERS = [name for name in BEHAVIOURS if name != "expert"]
-
-
-# ---- behaviours of segments
-
 
 @pytest.fixture(scope="module")
 def datasets(tmp_path_factory):
@@ -46,7 +41,7 @@ def test_rows_depend_neither_on_num_envs_nor_on_other_tasks(datasets, name, tmp_
 
 
 def test_metadata_describe_the_behaviour(datasets):
-    for name in OTHERS:
+    for name in {*BEHAVIOURS} - {"expert"}:
         config = read_metadata(datasets[name].root).config
         assert config.behaviour == name
         assert config.policy.acts == BEHAVIOURS[name]
@@ -66,13 +61,7 @@ def acting(behaviour):
     return actor
 
 
-@given(
-    right=st.floats(0.0, 1.0),
-    otherwise=st.sampled_from(["skill", "action"]),
-    shortest=st.integers(1, 30),
-    more=st.integers(0, 30),
-    episode=st.integers(0, 2**40),
-)
+@given(st.floats(0, 1), st.sampled_from(["skill", "action"]), *map(st.integers, (1, 0, 0), (30, 30, 2**40)))
 @settings(max_examples=30, deadline=None)
 def test_segments_have_the_given_lengths_and_probability(right, otherwise, shortest, more, episode):
     behaviour = Behaviour("any", right=right, otherwise=otherwise, shortest=shortest, longest=shortest + more)
@@ -114,9 +103,8 @@ def test_wrong_acts_by_skills_of_the_plan(tmp_path):
     """Each action is that of a skill of the plan in the same state."""
     dataset = collect(tmp_path / "demos", tasks="push", policy="wrong", noise_scale=0.0, max_steps=60)
     rows, plan = load_rows(dataset), segment_plans(["push"])["push"]
-    actions = SkillProgram({plan.definition: [step.skill for step in plan.steps]})(
-        rows["observation"].clone(), rows["task_id"].clone()
-    )
+    program = SkillProgram({plan.definition: [step.skill for step in plan.steps]})
+    actions = program(rows["observation"].clone(), rows["task_id"].clone())
     assert (actions == rows["unclipped_action"].unsqueeze(1)).all(-1).any(-1).all()
 
 
@@ -140,9 +128,6 @@ def test_a_checkpoint_records_seeds_and_tasks_of_its_demonstrations(tmp_path, da
         assert demonstrated_tasks(path) == tasks
         for seed in seeds:
             assert "is the seed of the demonstrations" in fails(capsys, "evaluate", path, "--seed", seed)
-
-
-# ---- trained policies, modules and functions
 
 
 @pytest.mark.parametrize("kind", ["plan", "description"])
@@ -199,7 +184,6 @@ def test_a_module_and_a_function_collect_the_same_rows(tmp_path):
 
     network = Tanh()
     module = TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
-
     by_module = collect(tmp_path / "module", policy=module, behaviour="mine")
     by_function = collect(tmp_path / "function", policy=lambda rows: module(rows), behaviour="mine", num_envs=2)
     assert same_rows(by_module, by_function)

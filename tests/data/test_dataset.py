@@ -5,6 +5,7 @@ import json
 import os
 import pickle
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from lw_torchrl.data import dataset as module
 from lw_torchrl.data.dataset import COLUMNS, FORMAT, MappedColumn, load_rows
 
 ALL = [(task, episode) for task in TASKS for episode in range(EPISODES)]
+DAMAGED = "metadata.json' is corrupted .*; delete the folder"
 
 
 @pytest.fixture
@@ -48,9 +50,6 @@ def test_unfinished_and_other_folders_are_errors(root):
     check_error(root, "is not a dataset")
     (root / ".partial").mkdir()
     check_error(root, "unfinished")
-
-
-DAMAGED = "metadata.json' is corrupted .*; delete the folder"
 
 
 @pytest.mark.parametrize(
@@ -151,8 +150,6 @@ def test_an_action_that_is_not_finite_is_an_error(root):
         LanguageWorldExperienceReplay(root, check=False)
 
 
-# ---- the rows of a buffer are read-only
-
 WAYS = {
     "all": lambda replay: replay[:],
     "a row": lambda replay: replay[3],
@@ -186,18 +183,12 @@ def test_assigning_rows_is_an_error(dataset, kind):
         with pytest.raises(RuntimeError, match="read-only"):
             replay[index] = row
     storage, patch = replay.storage, {"observation": torch.zeros(1, 39)}
-    for write in (
-        lambda: storage.set(0, row),
-        lambda: storage.set(slice(None), rows, set_cursor=False),
-        lambda: storage.__setitem__(0, row),
-        lambda: replay.extend(rows),
-        lambda: replay.add(row),
-        lambda: replay.update_if_present(index=torch.tensor([0]), generation=torch.tensor([0]), patch=patch),
-        replay.empty,
-        storage._empty,
-    ):
+    writes = [(storage.set, 0, row), (storage.__setitem__, 0, row), (replay.extend, rows), (replay.add, row)]
+    writes += [(partial(storage.set, set_cursor=False), slice(None), rows), (replay.empty,), (storage._empty,)]
+    first = {"index": torch.tensor([0]), "generation": torch.tensor([0])}
+    for write, *values in (*writes, (partial(replay.update_if_present, **first, patch=patch),)):
         with pytest.raises(RuntimeError, match=r"read-only|doesn't allow writing|generation"):
-            write()
+            write(*values)
     assert tree(dataset.root) == before
     assert (replay[:] == rows).all()
 

@@ -49,9 +49,8 @@ def exported(made, tmp_path_factory):
 @pytest.mark.parametrize("format", FORMATS)
 def test_export_and_import_change_no_bit(format):
     skip_without(format)
-    lengths = st.integers(1, 3).flatmap(
-        lambda each: st.lists(st.lists(st.integers(1, 12), min_size=each, max_size=each), min_size=1, max_size=3)
-    )
+    of_task = lambda each: st.lists(st.integers(1, 12), min_size=each, max_size=each)  # noqa: E731
+    lengths = st.integers(1, 3).flatmap(lambda each: st.lists(of_task(each), min_size=1, max_size=3))
 
     @settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.too_slow])
     @given(lengths=lengths, seed=st.integers(0, 99))
@@ -187,7 +186,6 @@ import hashlib, json, sys
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torchrl.data.datasets import LeRobotExperienceReplay
 import huggingface_hub
-
 root, work = sys.argv[1:]
 dataset = LeRobotDataset("mine/demos", root=root)
 rows = [dataset[place] for place in range(len(dataset))]
@@ -235,8 +233,6 @@ def test_another_suites_dataset_is_restored_too(format, tmp_path):
     out = lw.export_dataset(made.root, format, tmp_path / "out")
     assert tree(lw.import_dataset(out, tmp_path / "again").root) == tree(made.root)
 
-
-# ---- pictures as videos
 
 KEY = "observation.images.corner-32x48-every2"
 

@@ -16,6 +16,7 @@ DRAWS = np.random.default_rng(0)
 STATES = DRAWS.standard_normal((9, 39))
 ACTIONS = DRAWS.uniform(-1, 1, (9, 4)).astype(np.float32)
 LENGTHS = (4, 2, 3)
+LIBERO = {"problem_info": '{"language_instruction": "push"}', "env_args": '{"env_name": "Libero"}'}
 TASK_TEXTS = ("push-v3", "reach-v2-goal-observable", lw.TASKS["push"].description)
 
 
@@ -128,14 +129,7 @@ def robomimic(path, names, attributes=()):
     return path
 
 
-@pytest.mark.parametrize(
-    "attributes",
-    [
-        {"task": np.bytes_(b"push")},
-        {"env_args": json.dumps({"env_name": "push-v3"})},
-        {"problem_info": json.dumps({"language_instruction": "push"}), "env_args": json.dumps({"env_name": "Libero"})},
-    ],
-)
+@pytest.mark.parametrize("attributes", [{"task": np.bytes_(b"push")}, {"env_args": '{"env_name": "push-v3"}'}, LIBERO])
 def test_hdf5_of_robomimic_and_libero_is_imported(tmp_path, attributes):
     source = robomimic(tmp_path / "a.hdf5", ["demo_0"], attributes)
     made = imported(source, tmp_path / "out", "lacks the observation after the last .*; success")
@@ -170,9 +164,6 @@ def test_minari_datasets_are_imported(tmp_path, monkeypatch):
     made = lw.import_dataset(tmp_path / "minari" / "reach" / "theirs-v0", tmp_path / "out", task="reach")
     assert (made.num_steps, made.success_rate) == (8, {"reach": 1.0})
     assert_equal(load_rows(made)["next", "observation"], STATES[1:])
-
-
-# ---- files of other kinds
 
 
 def flat(path, **changed):

@@ -23,9 +23,8 @@ def _needs_open_gl():
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     root = tmp_path_factory.mktemp("pictures") / "demos"
-    lw.collect_demonstrations(
-        ["drawer-open", "reach"], episodes_per_task=2, root=root, noise_scale=0.1, seed=4, max_steps=12, progress=False
-    )
+    options = {"episodes_per_task": 2, "noise_scale": 0.1, "seed": 4, "max_steps": 12, "progress": False}
+    lw.collect_demonstrations(["drawer-open", "reach"], root=root, **options)
     render(root)
     return root
 

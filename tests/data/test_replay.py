@@ -11,17 +11,8 @@ from collecting import KINDS, Evil, collect, open_replay, tree
 from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import RandomSampler, SamplerWithoutReplacement, SliceSampler
-from torchrl.envs.transforms import (
-    BatchSizeTransform,
-    CatFrames,
-    Compose,
-    MultiStepTransform,
-    ObservationNorm,
-    RandomCropTensorDict,
-    Reward2GoTransform,
-    RewardScaling,
-    RewardSum,
-)
+from torchrl.envs import Compose, MultiStepTransform, ObservationNorm, RandomCropTensorDict, RewardScaling, RewardSum
+from torchrl.envs.transforms import BatchSizeTransform, CatFrames, Reward2GoTransform
 
 import lw_torchrl as lw
 from lw_torchrl.data import CoLearningSampler, JoinedDemonstrations, LanguageWorldExperienceReplay, TaskBalancedSampler
@@ -29,6 +20,9 @@ from lw_torchrl.data.dataset import load_rows
 from lw_torchrl.language.query_program import QueryProgram
 
 PLANS = lw.load_plans("MT10")
+SLICES = functools.partial(SliceSampler, slice_len=4, traj_key=("collector", "traj_ids"))
+FRAMES = functools.partial(CatFrames, 3, -1, in_keys=["observation"], out_keys=["frames"])
+RESHAPE = functools.partial(BatchSizeTransform, reshape_fn=lambda rows: rows.reshape(-1, 4).refine_names(None, "time"))
 
 
 @pytest.mark.parametrize("label", ["expert", "executed"])
@@ -45,10 +39,8 @@ def test_a_transform_answers_the_plans_queries(dataset, label):
 
 @pytest.mark.parametrize("sampler", [TaskBalancedSampler, lambda: CoLearningSampler("push")])
 def test_prefetching_one_batch_gives_the_same_batches(dataset, sampler):
-    ahead, now = (
-        open_replay(dataset.root, sampler=sampler(), transform=lw.QAFTransform(PLANS), prefetch=prefetch)
-        for prefetch in (1, None)
-    )
+    opened = functools.partial(open_replay, dataset.root, transform=lw.QAFTransform(PLANS))
+    ahead, now = (opened(sampler=sampler(), prefetch=prefetch) for prefetch in (1, None))
     for _ in range(40):
         assert (ahead.sample() == now.sample()).all()
     assert ahead._prefetch_queue
@@ -59,11 +51,6 @@ def test_transforms_of_written_rows_are_errors(dataset, make):
     for transform in (make(), Compose(RewardScaling(0.0, 1.0), Compose(make()))):
         with pytest.raises(ValueError, match=f"transform: {type(make()).__name__}"):
             LanguageWorldExperienceReplay(dataset.root, label="executed", transform=transform)
-
-
-SLICES = functools.partial(SliceSampler, slice_len=4, traj_key=("collector", "traj_ids"))
-FRAMES = functools.partial(CatFrames, 3, -1, in_keys=["observation"], out_keys=["frames"])
-RESHAPE = functools.partial(BatchSizeTransform, reshape_fn=lambda rows: rows.reshape(-1, 4).refine_names(None, "time"))
 
 
 @pytest.mark.parametrize("sampler", [None, RandomSampler, lw.TaskBalancedSampler, SamplerWithoutReplacement, SLICES])
@@ -100,9 +87,6 @@ def test_an_inverse_transform_changes_samples(dataset):
     assert not torch.equal(inverse.sample()["observation"], plain.sample()["observation"])
 
 
-# ---- episodes that end at success
-
-
 @pytest.fixture(scope="module")
 def ending(tmp_path_factory):
     """Two demonstrations each of push and reach, which succeed within 90 steps."""
@@ -133,9 +117,6 @@ def test_n_steps_end_with_the_episode(ending, ends):
     rows, ahead = (open_replay(ending.root, kind, reward="dense", **ends)[:] for kind in ("executed", "n steps"))
     assert (ahead == lw.data.n_step_returns(rows, 3, 0.9)).all()
     assert ahead["next", "done"].sum() == 3 * len(ending.episodes)
-
-
-# ---- the saved state
 
 
 def drawn(replay, batches=4):
@@ -194,14 +175,6 @@ def test_planted_pickles_are_never_executed(dataset, tmp_path):
     assert not trace.exists()
 
 
-# ---- columns that users add
-
-
-@pytest.fixture
-def both(dataset, other_dataset):
-    return [dataset.root, other_dataset.root]
-
-
 def numbered(replay):
     return torch.arange(len(replay), dtype=torch.float32)[:, None]
 
@@ -256,9 +229,6 @@ def test_values_of_other_rows_are_errors(both):
     assert len(turned) == len(replay)
     with pytest.raises(ValueError, match="of must hold the rows"):
         replay.add_column("other", numbered(turned), of=turned)
-
-
-# ---- several datasets and chosen episodes
 
 
 @pytest.fixture(scope="module")

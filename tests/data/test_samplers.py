@@ -10,14 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
-from torchrl.data import (
-    LazyMemmapStorage,
-    LazyStackStorage,
-    LazyTensorStorage,
-    ListStorage,
-    TensorDictReplayBuffer,
-    TensorStorage,
-)
+from torchrl.data import LazyMemmapStorage, LazyStackStorage, LazyTensorStorage, ListStorage
+from torchrl.data.replay_buffers import TensorDictReplayBuffer, TensorStorage
 
 from lw_torchrl.data import CoLearningSampler, TaskBalancedSampler
 from lw_torchrl.language.objects import GRIPPER, NamedObject
@@ -128,15 +122,10 @@ def test_shares_are_rounded_and_a_restored_state_continues_with_the_same_batches
         assert other.sampler.ran_out == replay.sampler.ran_out
 
 
-# ---- the target of a CoLearningSampler
-
-
-@pytest.mark.parametrize(
-    ("other", "name"),
-    [(CoLearningSampler("reach"), "target"), (CoLearningSampler(TARGET, target_fraction=0.25), "target_fraction")],
-)
-def test_the_state_of_another_target_or_ratio_is_an_error(other, name):
-    with pytest.raises(ValueError, match=f"state_dict has a different {name}"):
+@pytest.mark.parametrize("changed", [{"target": "reach"}, {"target_fraction": 0.25}])
+def test_the_state_of_another_target_or_ratio_is_an_error(changed):
+    other = CoLearningSampler(**{"target": TARGET, **changed})
+    with pytest.raises(ValueError, match=f"state_dict has a different {next(iter(changed))}"):
         other.load_state_dict(CoLearningSampler(TARGET).state_dict())
 
 
@@ -171,9 +160,6 @@ def test_row_weights_are_frequencies_of_rows(case, seed):
     assert weights.sum().item() == pytest.approx(1.0)
     if batches <= 20:
         torch.testing.assert_close(weights, counts / counts.sum())
-
-
-# ---- storages of several kinds, and storages that change
 
 
 @pytest.mark.parametrize("tail", [(), (1,), (10,), (2, 3)])
@@ -245,9 +231,6 @@ def test_every_row_of_a_storage_of_two_dimensions_comes_once(capacity):
     assert len(indices.unique(dim=0)) == rows
 
 
-# ---- states of other rows, and damaged files
-
-
 def begun(tasks=(1, 1, 1, 2, 2, 2, 2, 2), batch_size=4, seed=0):
     """Return a buffer whose passes have begun."""
     replay = make_replay(make_rows(tasks), batch_size, TaskBalancedSampler(), seed)
@@ -286,9 +269,6 @@ def test_a_damaged_file_is_an_error(tmp_path):
     with pytest.raises(ValueError, match=rf"path: '{tmp_path}' holds no sampler's state"):
         replay.sampler.loads(tmp_path)
     assert len(replay.sample()) == 4
-
-
-# ---- workers of a DataLoader
 
 
 def open_anew(replay, worker):

@@ -1,5 +1,6 @@
 """Selected episodes against an oracle written by hand, the rows that buffers show of them, and their rewards."""
 
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from lw_torchrl.data.rewards import REWARDS, episode_returns
 from lw_torchrl.training.minibatches import describe_data
 
 STEPS = 34
+SLICES = partial(SliceSampler, slice_len=4, traj_key=("collector", "traj_ids"))
+SAMPLERS = [lambda: None, RandomSampler, TaskBalancedSampler, lambda: CoLearningSampler("reach"), SLICES]
 BEHAVIOURS = {name: behaviour_of(name, TASKS) for name in ("expert", "random", "wrong")}
 CONFIGS = {
     (each, name): CollectConfig(TASKS, each, 0, policy=BEHAVIOURS[name]) for each in range(5)[1:] for name in BEHAVIOURS
@@ -153,16 +156,7 @@ def test_filters_see_episodes_as_they_are_shown(made):
         assert torch.equal(replay[-1:]["next", "terminated"], torch.tensor([["terminate_on_success" in ends]]))
 
 
-@pytest.mark.parametrize(
-    "sampler",
-    [
-        lambda: None,
-        RandomSampler,
-        TaskBalancedSampler,
-        lambda: CoLearningSampler("reach"),
-        lambda: SliceSampler(slice_len=4, traj_key=("collector", "traj_ids")),
-    ],
-)
+@pytest.mark.parametrize("sampler", SAMPLERS)
 @pytest.mark.parametrize("order", [("scripted", "random"), ("random", "scripted")])
 @pytest.mark.parametrize("options", [dict(), dict(n_steps=3, gamma=0.9), dict(terminate_on_success=True)])
 def test_a_part_without_kept_episodes_does_not_change_batches(made, sampler, order, options):
@@ -184,9 +178,6 @@ def test_the_description_of_the_data_names_the_episodes(made):
     one, other = (opened(made, "scripted", episodes={"reach": 5}, keep=EpisodeFilter(success=s)) for s in (True, False))
     assert describe_data(one) != describe_data(other)
     assert describe_data(one)["parts"] == describe_data(other)["parts"]
-
-
-# ---- rewards
 
 
 @pytest.mark.parametrize("name", list(REWARDS))

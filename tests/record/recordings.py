@@ -4,6 +4,7 @@ import io
 import socket
 import uuid
 from contextlib import contextmanager
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,22 +30,14 @@ PLAN = SimpleNamespace(steps=[SimpleNamespace(condition=parse_query(c, "push"), 
 
 def make_rollout(length=20, columns=3, seed=0):
     """Return random numbers in a rollout's shapes; the columns beyond the plan's two steps are padding."""
-    generator = torch.Generator().manual_seed(seed)
-    qaf = torch.rand(length, columns, generator=generator) > 0.5
+    draw = partial(torch.rand, generator=torch.Generator().manual_seed(seed))
+    qaf = draw(length, columns) > 0.5
     qaf[:, len(STEPS) :] = False
     skill_weights = torch.zeros(length, columns)
     skill_weights[:, : len(STEPS)] = torch.softmax(qaf[:, : len(STEPS)] * 10.0 - 5.0, -1)
-    return TensorDict(
-        {
-            "observation": torch.rand(length, 39, generator=generator),
-            "action": torch.rand(length, 4, generator=generator) * 2 - 1,
-            "qaf": qaf,
-            "skill_weights": skill_weights,
-            ("next", "success"): torch.arange(length)[:, None] >= length // 2,
-            ("next", "reward"): torch.rand(length, 1, generator=generator),
-        },
-        [length],
-    )
+    rollout = {"observation": draw(length, 39), "action": draw(length, 4) * 2 - 1, "qaf": qaf}
+    after = {"success": torch.arange(length)[:, None] >= length // 2, "reward": draw(length, 1)}
+    return TensorDict({**rollout, "skill_weights": skill_weights, "next": after}, [length])
 
 
 def run(tasks, length, *, seed=5, plans=None, skills=None):

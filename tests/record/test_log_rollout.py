@@ -87,7 +87,8 @@ def test_bodies_have_the_poses_of_mujoco(tmp_path, tasks):
 def test_the_viewer_reports_no_fault(tmp_path, pushed):
     logged(tmp_path / "a.rrd", pushed, plans=PLANS, seed=SEED)
     with skip_without_graphics_driver():
-        open_viewer(tmp_path / "a.rrd", tmp_path / "a.png", "800x600")  # a report of a view would be a warning
+        open_viewer(tmp_path / "a.rrd", tmp_path / "a.png", "800x600", step=10)  # a report of a view would be a warning
+    assert (tmp_path / "a.png").read_bytes()[16:24] == (800).to_bytes(4, "big") + (600).to_bytes(4, "big")
 
 
 def test_a_page_is_small_and_fast(tmp_path):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from cases import read_cases
 from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, record
 
 from lw_torchrl.language.outline import short_condition
@@ -19,7 +20,6 @@ ROWS = [f"/e1/{i}_" + short_condition(step.condition).replace(" ", "_") for i, s
 def test_an_episode_is_read_back_exactly(tmp_path):
     rollout = make_rollout()
     recording = record(tmp_path / "a.rrd", rollout)
-
     points = {
         f"objects/{name}".replace("'", "\\'").replace(" ", "\\ "): at for name, at in make_objects(rollout).items()
     }
@@ -31,7 +31,6 @@ def test_an_episode_is_read_back_exactly(tmp_path):
     curves = {"action": rollout["action"], "skill_weights": rollout["skill_weights"][:, :2]}
     for name, values in {**curves, "reward": rollout["next", "reward"]}.items():
         np.testing.assert_array_equal(recording.array(f"/push/{name}", "Scalars:scalars"), values.double())
-
     for i, row in enumerate(ROWS):
         assert recording.states(row, 20) == ["true" if held else "false" for held in rollout["qaf"][:, i]]
     assert recording.states("/e1/0_verdict", 20, first=1) == ["not yet"] * 10 + ["success"] * 10
@@ -147,21 +146,8 @@ def test_episodes_have_different_names(tmp_path):
         np.testing.assert_array_equal(action, rollout["action"].double())
 
 
-SHORTENED = """
-peg-insert-side: gripper near peg and open: gripper near peg and open
-box-close: gripper not left of the lid and gripper not around the lid: gripper not left or around lid
-box-close: the lid is near the lid top and the lid is not near the box: lid near lid top and not near box
-stick-pull: stick not touching the table and stick not above thermos and stick right of thermos: \
-stick off table and not above but right of thermos
-push: gripper not open or near puck: gripper not open or gripper near puck
-push: gripper near puck and (open or puck touching the table): gripper near puck and (gripper open or puck on table)
-push: always: always
-"""
-
-
-@pytest.mark.parametrize("case", SHORTENED.strip().splitlines())
-def test_conditions_are_shortened(case):
-    task, text, short = case.split(": ")
+@pytest.mark.parametrize(("task", "text", "short"), read_cases("record/shortened.toml")["cases"])
+def test_conditions_are_shortened(task, text, short):
     assert short_condition(parse_query(text, task)) == short
     assert short_condition("free-form text") == "free-form text"
 

@@ -67,7 +67,6 @@ FILLED = """
 import resource
 from lw_torchrl.record.rollouts import new_recording
 from recordings import make_rollout
-
 with new_recording(sys.argv[1]) as logger:
     logger.log_episode(make_rollout(400), task="push", objects={})
     logger.flush()
@@ -107,7 +106,6 @@ KILLED = """
 import time
 from lw_torchrl.record import RerunLogger
 from recordings import make_rollout
-
 logger = RerunLogger(sys.argv[1])
 logger.log_episode(make_rollout(40), task="push", objects={})
 for number in range(10**6):
@@ -136,7 +134,6 @@ def test_a_killed_run_leaves_a_readable_recording(tmp_path):
 FULL = """
 import resource, signal, time, warnings
 from lw_torchrl.record import RerunLogger
-
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 with warnings.catch_warnings(record=True) as caught:

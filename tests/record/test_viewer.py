@@ -117,13 +117,6 @@ def test_web_viewer_is_served_on_this_machine_until_interrupted(tmp_path):
     assert not listens(address.port)
 
 
-def test_a_screenshot_has_the_window_size(tmp_path):
-    write(tmp_path / "a.rrd")
-    with skip_without_graphics_driver():
-        open_viewer(tmp_path / "a.rrd", tmp_path / "a.png", "800x600", step=10)
-    assert (tmp_path / "a.png").read_bytes()[16:24] == (800).to_bytes(4, "big") + (600).to_bytes(4, "big")
-
-
 @pytest.fixture
 def seen(monkeypatch):
     """Run open_viewer's window without a screen; return its cursors, and the views of its front tab."""
