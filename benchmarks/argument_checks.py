@@ -30,7 +30,7 @@ def checking_nodes(tree: ast.AST) -> Iterator[ast.stmt | ast.expr]:
         if isinstance(node, ast.Raise) or only_raises:
             yield node
         elif isinstance(node, (ast.FunctionDef, ast.ClassDef)):
-            if isinstance(node, ast.FunctionDef) and node.name.lstrip("_").startswith("check"):
+            if isinstance(node, ast.FunctionDef) and re.match("_?check(?!sum|point)", node.name):
                 yield node
             yield from (d for d in node.decorator_list if ast.unparse(d).startswith(("typed", "checked", "beartype")))
         elif isinstance(node, ast.Expr) and re.match(r"(\w+\.)*_?check\w*\(", ast.unparse(node)):

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lw_torchrl._util.checks import counted, typed
+from lw_torchrl._util.checks import typed
+from lw_torchrl._util.text import counted
 from lw_torchrl.evaluation import EvaluationResult
 
 Array = NDArray[np.float64]

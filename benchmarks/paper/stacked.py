@@ -21,7 +21,7 @@ from lw_torchrl.modules.describe import describe
 from lw_torchrl.training.checkpoint import check_can_be_saved, text_vectors
 from lw_torchrl.training.cloning import BehavioralCloningConfig
 from lw_torchrl.training.loop import Training, TrainingOptions, make_optimizer
-from lw_torchrl.training.minibatches import Minibatches, check_replay, describe_data, describe_replay
+from lw_torchrl.training.minibatches import Minibatches, check_minibatches, describe_data, describe_replay
 from lw_torchrl.training.normalization import check_contacts, fit_normalization, statistics_of
 from lw_torchrl.transforms import FallbackTurns, JitterTarget, QAFTransform, RandomYaw
 
@@ -99,7 +99,7 @@ class StackedBehavioralCloning(Training):
             }
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
             actor.to(self.device)
-            check_replay(actor, replay, config.batch_size)
+            check_minibatches([actor], replay, config.batch_size)
             self.minibatches.append(Minibatches(replay, config.batch_size, config.seed + number, self.device))
             if config.normalize and statistics_of(actor):
                 fit_normalization(actor, replay)

@@ -141,10 +141,8 @@ def checker(hint: Any) -> Callable[[Any], bool]:
 def _words(hint: Any) -> str:
     """Describe a type hint in words, such as "an integer of at least 1"."""
     kind, parts = get_origin(hint), get_args(hint)
-    if kind in (Union, UnionType):
-        return " or ".join(map(_words, parts))
-    if kind is Literal:
-        return " or ".join(map(repr, parts))
+    if kind in (Union, UnionType, Literal):
+        return " or ".join(map(repr if kind is Literal else _words, parts))
     if words := _WORDS.get(hint) or _WORDS.get(kind):
         return words
     if kind is Annotated:
@@ -195,11 +193,6 @@ def missing_keys(present: Iterable[Any], *needed: str) -> ValueError:
     absent = [key for key in needed if key not in names]
     hint = "; add QAFTransform(plans), which writes qaf, to the environment or buffer" if "qaf" in absent else ""
     return ValueError(f"the tensordict must have {' and '.join(absent)}, got {', '.join(names)}{hint}")
-
-
-def counted(number: int, noun: str) -> str:
-    """Return a number followed by a noun, which is plural unless the number is 1: "1 task", "50 tasks"."""
-    return f"{number} {noun}" + "s" * (number != 1)
 
 
 _SHORT = Repr()

@@ -86,8 +86,8 @@ def check_device(argument: str, value: Any) -> torch.device:
         return CPU if device.type == "cpu" else torch.empty(0, device=device).device
     except (RuntimeError, AssertionError, TypeError) as error:  # PyTorch raises several types, with long messages
         reason = str(error).partition("\n")[0]
-        allowed = f"{argument} must be 'cpu', 'auto' or a device of this machine"
-        raise ValueError(f"{allowed}, got {shown(value)} ({reason})") from error
+        must = f"{argument} must be 'cpu', 'auto' or a device of this machine"
+        raise ValueError(f"{must}, got {shown(value)} ({reason})") from error
 
 
 def device_of(module: Any) -> torch.device:

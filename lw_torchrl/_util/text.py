@@ -36,3 +36,8 @@ class PrintableStream:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number followed by a noun, which is plural unless the number is 1: "1 task", "50 tasks"."""
+    return f"{number} {noun}" + "s" * (number != 1)

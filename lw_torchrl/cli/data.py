@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import Count, Natural, Scale, counted
+from lw_torchrl._util.checks import Count, Natural, Scale
+from lw_torchrl._util.text import counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Columns, Flag, Maybe, Output, Row
 from lw_torchrl.language.tasks import TASKS

@@ -11,8 +11,9 @@ from typing import Annotated, Any
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import Count, Natural, Positive, Scale, counted
+from lw_torchrl._util.checks import Count, Natural, Positive, Scale
 from lw_torchrl._util.files import locked, write_json
+from lw_torchrl._util.text import counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Flag, Maybe, Output
 from lw_torchrl.language.nearest import nearest_skill

@@ -10,9 +10,9 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import Natural, counted, nearest
+from lw_torchrl._util.checks import Natural, nearest
 from lw_torchrl._util.files import read_text, read_toml
-from lw_torchrl._util.text import printable
+from lw_torchrl._util.text import counted, printable
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Columns, Maybe, Output, Row
 from lw_torchrl.language.nearest import nearest_skill

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import Count, check_value, counted
+from lw_torchrl._util.checks import Count, check_value
 from lw_torchrl._util.files import read_text
-from lw_torchrl._util.text import printable
+from lw_torchrl._util.text import counted, printable
 from lw_torchrl._util.workers import start_early
 from lw_torchrl.language.plan_files import PLAN_LIMIT, is_pairs, load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import Count, Natural, Positive, Probability, Scale, check_choice, counted
+from lw_torchrl._util.checks import Count, Natural, Positive, Probability, Scale, check_choice
 from lw_torchrl._util.files import read_text
-from lw_torchrl._util.text import printable
+from lw_torchrl._util.text import counted, printable
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Columns, Flag, Maybe, Output, Row
 from lw_torchrl.language.formats import PLAN_FORMATS

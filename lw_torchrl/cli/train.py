@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import Count, Natural, Probability, Scale, counted
+from lw_torchrl._util.checks import Count, Natural, Probability, Scale
+from lw_torchrl._util.text import counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Maybe, Output, read_evaluator
 

@@ -137,12 +137,10 @@ def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName
 
 def check_behaviours(parts: Sequence[Demonstrations]) -> None:
     """Raise :class:`ValueError` if datasets use the same label for different behaviours."""
-    first: dict[str, Demonstrations] = {}
-    for part in parts:
-        before = first.setdefault(part.config.behaviour, part)
-        if before.config.policy.acts != part.config.policy.acts:
-            folders = f"{str(before.root)!r} and {str(part.root)!r}"
-            raise ValueError(f"root: the label {part.config.behaviour!r} stands for different behaviours in {folders}")
+    acts: dict[str, Any] = {}
+    for part, label in ((part, part.config.behaviour) for part in parts):
+        if acts.setdefault(label, part.config.policy.acts) != part.config.policy.acts:
+            raise ValueError(f"root: the label {label!r} in {str(part.root)!r} is another behaviour in other folders")
 
 
 def select(

@@ -7,8 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lw_torchrl._util.checks import counted, typed
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import AnyPath, replacing
+from lw_torchrl._util.text import counted
 from lw_torchrl.evaluation.diagnose.failure import CAUSE_COLORS, CAUSES
 from lw_torchrl.evaluation.result import EvaluationResult, wilson_interval
 

@@ -11,9 +11,9 @@ from string import Template
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lw_torchrl._util.checks import counted, typed
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import AnyPath, replacing, shipped_policy, write_text
-from lw_torchrl._util.text import markdown, printable
+from lw_torchrl._util.text import counted, markdown, printable
 from lw_torchrl.evaluation.result import EvaluationResult, wilson_interval
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.training.checkpoint import demonstrated_tasks, load_actor, policy_file, read_description

@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from lw_torchrl._util.checks import Count, check_choice, check_value, counted, shown, typed, unknown_name
+from lw_torchrl._util.checks import Count, check_choice, check_value, shown, typed, unknown_name
 from lw_torchrl._util.files import AnyPath, expanded, read_json, read_text, write_json, write_text
 from lw_torchrl._util.reproducibility import differences
+from lw_torchrl._util.text import counted
 from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
 from lw_torchrl.language.nearest import StepMapper
 from lw_torchrl.language.plan_decoding import DecodedPlan, decode_as, decode_plan

@@ -15,7 +15,8 @@ from time import monotonic
 from typing import Any
 from urllib.parse import urlsplit
 
-from lw_torchrl._util.checks import counted, shown
+from lw_torchrl._util.checks import shown
+from lw_torchrl._util.text import counted
 from lw_torchrl.planners.answer_files import PlannerError, Reply, Tokens
 
 OPENAI = "https://api.openai.com/v1"

@@ -12,9 +12,10 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_value, counted, shown, typed
+from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_value, shown, typed
 from lw_torchrl._util.files import AnyPath, expanded, read_json, write_json
 from lw_torchrl._util.progress import Progress
+from lw_torchrl._util.text import counted
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import TASKS, Task, TaskList, Tasks, get_task, named_tasks

@@ -21,7 +21,7 @@ from lw_torchrl.modules.describe import describe
 from lw_torchrl.modules.query_evaluator import evaluators_of
 from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.loop import Training, TrainingOptions, make_optimizer
-from lw_torchrl.training.minibatches import Minibatches, check_replay, describe_data, describe_replay
+from lw_torchrl.training.minibatches import Minibatches, check_minibatches, describe_data, describe_replay
 from lw_torchrl.training.normalization import check_contacts, fit_normalization, statistics_of
 from lw_torchrl.transforms.qaf import plan_program
 
@@ -145,7 +145,9 @@ class BehavioralCloningTrainer(Training):
         super().__init__(config, **options)
         self.actor, self.module, self.replay, self.networks = actor, actor, replay, [actor]
         self.device = place(actor, device)
-        check_replay(actor, replay, config.batch_size)
+        if "action" not in actor.out_keys:
+            raise ValueError(f"actor must write 'action', but writes {', '.join(map(str, actor.out_keys))}")
+        check_minibatches([actor], replay, config.batch_size)
         self._anchor = EvaluatorAnchor(actor) if config.qaf_anchor else None
         if self.checkpoint is not None:
             check_can_be_saved(actor)

@@ -19,7 +19,6 @@ from torchrl.objectives import BCLoss, LossModule
 from lw_torchrl._util.devices import CPU, seeded
 from lw_torchrl.data.replay import DatasetStorage
 from lw_torchrl.data.samplers import GroupSampler, device_of_rows
-from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.modules.relative_features import FocusFeatures, RoleFeatures
 from lw_torchrl.transforms.augmentation import JitterTarget
@@ -124,8 +123,7 @@ def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, s
     for network, answered in product(networks, map(plans_of, replay.transform)):
         own = plans_of(network)
         if own is not None and answered is not None and (different := answered.differences(own)):
-            plans = f"the {'critic' if isinstance(network, Value) else 'actor'}'s plans"
-            raise ValueError(f"replay's QAFTransform must use {plans}, but they differ for {', '.join(different)}")
+            raise ValueError(f"replay's QAFTransform must use the actor's plans; they differ in {', '.join(different)}")
     if replay._prefetch:
         raise ValueError("replay must not prefetch: prefetched batches would be lost when training resumes")
     if replay.batch_size not in (None, size):
@@ -134,13 +132,6 @@ def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, s
         raise ValueError("replay must not use a PrioritizedSampler, because the trainers do not update priorities")
     if not _draws_on_cpu(replay) and device_of_rows(replay.storage) != CPU:
         raise ValueError("replay: draws on the GPU cannot be resumed; use a TaskBalancedSampler, or rows on the CPU")
-
-
-def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:
-    """Raise :class:`ValueError` unless an actor writes ``action`` and passes :func:`check_minibatches`."""
-    if "action" not in actor.out_keys:
-        raise ValueError(f"actor must write 'action', but writes {', '.join(map(str, actor.out_keys))}")
-    check_minibatches([actor], replay, size)
 
 
 def check_augmentations(loss: LossModule, networks: Iterable[nn.Module], replay: TensorDictReplayBuffer) -> None:

@@ -9,7 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._util.checks import Count, Scale, counted, missing_keys, typed
+from lw_torchrl._util.checks import Count, Scale, missing_keys, typed
+from lw_torchrl._util.text import counted
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, Cause, Failure, Finding
 from lw_torchrl.evaluation.diagnose.replacements import EpisodeId, Scripts

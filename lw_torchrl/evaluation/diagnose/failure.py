@@ -10,8 +10,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 from beartype.vale import Is
 from tensordict import TensorDictBase
 
-from lw_torchrl._util.checks import Count, Finite, Natural, counted, shown, typed_fields
+from lw_torchrl._util.checks import Count, Finite, Natural, shown, typed_fields
 from lw_torchrl._util.files import read_toml
+from lw_torchrl._util.text import counted
 from lw_torchrl.language.plans import ConditionalPlan
 
 _TABLES = read_toml(files("lw_torchrl.evaluation") / "data" / "causes.toml", ValueError)

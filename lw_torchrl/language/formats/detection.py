@@ -8,7 +8,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, TypeAlias
 
-from lw_torchrl._util.checks import counted, shown
+from lw_torchrl._util.checks import shown
+from lw_torchrl._util.text import counted
 from lw_torchrl.language.expressions import (
     FALSE,
     TRUE,
