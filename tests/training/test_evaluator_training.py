@@ -141,7 +141,8 @@ def test_the_anchor_keeps_the_answers_exact(demos):
 
     free, anchored = trainer(0.0), trainer(1.0)
     before = agreement(free)
-    free.train(), anchored.train()
+    free.train()
+    anchored.train()
     assert agreement(anchored) > max(before + 0.1, agreement(free) + 0.1, 0.9)
 
 

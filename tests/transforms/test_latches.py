@@ -19,11 +19,6 @@ from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.queries import Clause, Query, parse_query
 from lw_torchrl.language.query_program import QueryProgram
 
-PUSH = [
-    ("robot's gripper", "near", "puck"),
-    ("robot's gripper", "left of", "puck"),
-    ("puck", "above", "target location"),
-]
 CLAUSES = {
     "push": [*(Clause("robot's gripper", *words) for words in (("near", "puck"), ("left of", "puck"), ("open",)))],
     "reach": [Clause("robot's gripper", relation, "reach target") for relation in ("left of", "above")],

@@ -25,10 +25,6 @@ def rows(number=64, seed=0, reach=0.6):
     return TensorDict({"observation": draw(number, 39), "action": (2 * draw(number, 4) - 1) * reach}, [number])
 
 
-def angle(vectors):
-    return torch.atan2(vectors[..., 1], vectors[..., 0])
-
-
 def wrapped(angles):
     """Return the same angles in [-pi, pi)."""
     return torch.remainder(angles + torch.pi, 2 * torch.pi) - torch.pi
@@ -36,7 +32,7 @@ def wrapped(angles):
 
 def between(first, second):
     """Return the angle from the first to the second."""
-    return wrapped(angle(second) - angle(first))
+    return wrapped(torch.atan2(second[..., 1], second[..., 0]) - torch.atan2(first[..., 1], first[..., 0]))
 
 
 @settings(deadline=None, max_examples=40)
