@@ -34,7 +34,6 @@ def make_descriptor(tasks="MT10", seed=0, **options):
 
 
 def make_role_actor(plans=CANONICAL, seed=0, **options):
-    torch.manual_seed(seed)
     return make_actor(plans, seed, features=m.RoleFeatures(plans), **options)
 
 
@@ -58,16 +57,13 @@ ACTORS = {
 def make_rows(*shape, plans=PLANS, seed=0, answered=True):
     """Return random states of the plans' tasks, with random ``qaf``, which is false beyond a plan's last step."""
     generator = torch.Generator().manual_seed(seed)
-    names = list(plans)
-    chosen = torch.randint(len(names), tuple(shape), generator=generator)
-    rows = TensorDict(
-        observation=torch.rand(*shape, 39, generator=generator),
-        task_id=torch.tensor([lw.task_id(name) for name in names])[chosen],
-        batch_size=shape,
+    chosen = torch.randint(len(plans), tuple(shape), generator=generator)
+    ids, lengths = torch.tensor([(lw.task_id(name), len(plan.steps)) for name, plan in plans.items()])[chosen].unbind(
+        -1
     )
+    rows = TensorDict(observation=torch.rand(*shape, 39, generator=generator), task_id=ids, batch_size=shape)
     if not answered:
         return rows
-    lengths = torch.tensor([len(plans[name].steps) for name in names])[chosen]
     truth = torch.rand(*shape, plans.num_steps, generator=generator) > 0.6
     return rows.set("qaf", truth & (torch.arange(plans.num_steps) < lengths.unsqueeze(-1)))
 
@@ -84,7 +80,7 @@ def action_of(actor, rows):
 
 
 def assert_a_logit_for_each_step(evaluator, rows):
-    """Check an evaluator's logits for 64 rows, the size of evaluation's blocks, in any order and shape."""
+    """Check and return an evaluator's logits for 64 rows, the size of evaluation's blocks, in any order and shape."""
     logits = evaluator(rows.clone())["qaf_logits"]
     assert logits.shape == (64, evaluator.plans.num_steps)
     assert logits.dtype == torch.float32
@@ -92,6 +88,7 @@ def assert_a_logit_for_each_step(evaluator, rows):
         steps = len(evaluator.plans[lw.MT50[task]].steps)
         assert (logits[row, :steps].abs() <= 31).all()
         assert (logits[row, steps:] == -1e4).all()
-    order = torch.randperm(64, generator=torch.Generator().manual_seed(1))
+    order = torch.randperm(64)
     assert torch.equal(evaluator(rows[order])["qaf_logits"], logits[order])
     assert torch.equal(evaluator(rows.reshape(4, 16))["qaf_logits"].reshape(64, -1), logits)
+    return logits

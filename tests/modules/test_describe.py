@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from small_actors import ACTORS, CANONICAL, PLANS, letters, make_actor, rows_for
+from small_actors import ACTORS, CANONICAL, PLANS, letters, make_actor, make_role_actor, rows_for
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
@@ -18,9 +18,7 @@ MODULES = ACTORS | {
     "raw features": lambda: m.ObservationFeatures("raw", 0.2, in_keys=[("robot", "state")]),
     "concatenated features": lambda: m.Concat(m.ObservationFeatures(), m.RoleFeatures(CANONICAL, 0.1), out_keys=["x"]),
     "evaluator": lambda: lw.modules.StateQueryEvaluator(PLANS, width=8, answers="hard"),
-    "transferred": lambda: m.TransferredActor(
-        make_actor(CANONICAL, features=m.RoleFeatures(CANONICAL)), CANONICAL, speed=2.0
-    ),
+    "transferred": lambda: m.TransferredActor(make_role_actor(), CANONICAL, speed=2.0),
 }
 
 

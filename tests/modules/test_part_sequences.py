@@ -1,4 +1,4 @@
-"""Sequences of parts: renamed keys, the plans of all parts, and modules that are shared."""
+"""Sequences of parts: renamed keys, shared modules; truth of other plans than an actor's, which is refused."""
 
 import pytest
 import torch
@@ -8,10 +8,12 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 
 import lw_torchrl as lw
+from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.modules import (
     ActorEnsemble,
     Concat,
     FocusFeatures,
+    PlanAttention,
     SkillMixer,
     Value,
     plan_trunk,
@@ -19,9 +21,7 @@ from lw_torchrl.modules import (
 )
 
 PLANS = lw.load_plans("MT10")
-REVERSED = lw.Plans(
-    [lw.ConditionalPlan(plan.task, tuple(reversed(plan.steps)), plan.definition) for plan in PLANS.values()]
-)
+REVERSED = lw.Plans([lw.ConditionalPlan(plan.task, plan.steps[::-1], plan.definition) for plan in PLANS.values()])
 IDS = torch.tensor([lw.task_id("push"), lw.task_id("reach")])
 
 
@@ -97,3 +97,88 @@ def test_features_in_a_sequence_follow_other_plans():
     lost.plans = PLANS
     with pytest.raises(TypeError, match="TensorDictModule"):
         lw.PlanConditionedActor(PLANS, features=lost).with_plans(REVERSED)
+
+
+PLACE = ("the gripper is not above the puck", "place the gripper above the puck")
+LOWER = ("the gripper is above the puck", "lower the gripper around the puck")
+REFUSED = "qaf was computed with plans.* push"
+
+
+def push_plans(pairs, *more):
+    return lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs), *more])
+
+
+PUSH = push_plans([PLACE, LOWER])
+OTHERS = {
+    "steps in another order": push_plans([LOWER, PLACE]),
+    "another condition": push_plans([(f"{PLACE[0]} and the gripper is open", PLACE[1]), LOWER]),
+    "another skill": push_plans([PLACE, (LOWER[0], "close the gripper around the puck")]),
+}
+ACTORS = {
+    "actor": lambda plans, **keys: lw.PlanConditionedActor(plans, **keys),
+    "focus": lambda plans, **keys: lw.PlanConditionedActor(plans, features=FocusFeatures(plans), **keys),
+    "scripted": lw.ScriptedSkillActor,
+    "ensemble": lambda plans, **keys: ActorEnsemble([lw.PlanConditionedActor(plans, **keys)] * 2),
+    "attention": lambda plans: PlanAttention(plans),
+}
+
+
+def rows_of(plans):
+    data = TensorDict(observation=torch.zeros(3, 39), task_id=torch.full((3,), lw.task_id("push")))
+    return lw.QAFTransform(plans)(data.auto_batch_size_())
+
+
+@pytest.mark.parametrize("other", OTHERS)
+@pytest.mark.parametrize("make", ACTORS)
+def test_actor_refuses_truth_of_other_plans(make, other):
+    actor = ACTORS[make](PUSH)
+    with pytest.raises(ValueError, match=REFUSED):
+        actor(rows_of(OTHERS[other]))
+    assert actor(rows_of(OTHERS[other]).exclude("qaf_plan"))["skill_weights"].shape == (3, 2)
+    assert actor(rows_of(push_plans([PLACE, LOWER])))["skill_weights"].shape == (3, 2), "equal plans"
+
+
+def test_each_row_carries_the_number_of_its_plan():
+    reach = lw.ConditionalPlan.from_pairs("reach", [("the gripper is open", "close the gripper")] * 2)
+    both = push_plans([PLACE, LOWER], reach)
+    mixed = TensorDict(observation=torch.zeros(4, 39), task_id=IDS.repeat(2))
+    mixed = lw.QAFTransform(both)(mixed.auto_batch_size_())
+    assert mixed["qaf_plan"].tolist() == [both.numbers["push"], both.numbers["reach"]] * 2
+    assert mixed["qaf_plan"][0] == rows_of(PUSH)["qaf_plan"][0], "whatever stands beside it"
+    lw.PlanConditionedActor(both)(mixed)
+    other = lw.ConditionalPlan.from_pairs("reach", [("the gripper is closed", "close the gripper")] * 2)
+    with pytest.raises(ValueError, match="for reach; pass"):
+        lw.PlanConditionedActor(push_plans([PLACE, LOWER], other))(mixed)
+
+
+def test_refusal_after_a_relation_was_redefined(monkeypatch):
+    before = lw.PlanConditionedActor(PUSH)
+    monkeypatch.setitem(RELATIONS, "above", (Comparison("z", ">", 0.3),))
+    with pytest.raises(ValueError, match=REFUSED):
+        before(rows_of(PUSH))
+    lw.PlanConditionedActor(PUSH)(rows_of(PUSH))
+
+
+def test_vmap_over_rows_skips_the_check_and_over_weights_keeps_it():
+    actor, data = lw.PlanConditionedActor(PUSH).eval(), rows_of(OTHERS["another skill"])
+    assert torch.vmap(lambda row: actor(row)["action"])(data.exclude("action")).shape == (3, 4)
+    params = TensorDict.from_module(actor).expand(2).clone()
+
+    def act(params):
+        with params.to_module(actor):
+            return actor(data.copy())["action"]
+
+    with pytest.raises(ValueError, match=REFUSED):  # over weights the numbers can be read
+        torch.vmap(act)(params)
+
+
+def test_compiled_actor_refuses_at_run_time():
+    actor = lw.PlanConditionedActor(PUSH).eval()
+    act = torch.compile(lambda data: actor(data)["action"], backend="eager")
+    assert act(rows_of(PUSH)).shape == (3, 4)
+    with pytest.raises(RuntimeError, match="qaf was computed with plans"):
+        act(rows_of(OTHERS["another skill"]))
+    wrong = rows_of(PUSH)
+    wrong["observation"][1, 2] = torch.nan
+    with pytest.raises(RuntimeError, match="finite numbers"):
+        act(wrong)

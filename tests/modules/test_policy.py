@@ -58,21 +58,15 @@ def test_with_plans_shares_every_weight(name):
     assert (plans_of(other), other.training) == (lw.Plans(own), False)
     assert {id(one) for one in other.parameters()} == {id(one) for one in actor.parameters()}
     rows = make_rows(4, plans=lw.Plans(own), answered=False)
-    output = []
-    for each in (actor, other):
-        transform = transform_of(each)
-        output.append(each(rows.copy() if transform is None else transform(rows.copy()))["action"])
-    torch.testing.assert_close(*output)
+    transforms = [(each, transform_of(each) or nn.Identity()) for each in (actor, other)]
+    torch.testing.assert_close(*(each(transform(rows.copy()))["action"] for each, transform in transforms))
 
 
 def test_actors_that_cannot_follow_other_plans_are_refused():
     with pytest.raises(TypeError, match="with_plans"):
         with_plans(make_descriptor(), PLANS)
 
-    class Mine(TensorDictModule):
-        pass
-
-    mine = Mine(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
+    mine = type("Mine", (TensorDictModule,), {})(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
     mine.plans = PLANS
     with pytest.raises(TypeError, match="Mine"):
         with_plans(mine, PLANS)

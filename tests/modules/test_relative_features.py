@@ -112,45 +112,47 @@ def rows_of(plans, seen):
     return TensorDict(observation=seen[0], task_id=ids, batch_size=[len(ids)])
 
 
-@pytest.mark.parametrize(
-    ("task", "step", "way"),
-    [
-        ("push", 0, lambda o: o[:, 4:7] - o[:, :3]),
-        ("push", 3, lambda o: o[:, 36:39] - o[:, 4:7]),
-        ("assembly", 3, lambda o: o[:, 36:39] - o[:, 4:7] - torch.tensor([-0.13, 0.0, 0.0])),
-        ("peg-unplug-side", 3, lambda o: o[:, 36:39] - o[:, 4:7]),  # the goal, which that task has no name for
-    ],
-)
-def test_position_points_from_the_moved_object_to_the_target(task, step, way):
+WAYS = [("push", 0, HAND, OBJECT, 0.0), ("push", 3, OBJECT, GOAL, 0.0), ("assembly", 3, OBJECT, GOAL, 0.13)]
+WAYS += [("peg-unplug-side", 3, OBJECT, GOAL, 0.0)]  # the goal, which that task has no name for
+
+
+@pytest.mark.parametrize(("task", "step", "moved", "target", "beside"), WAYS)
+def test_position_points_from_the_moved_object_to_the_target(task, step, moved, target, beside):
     seen, roles = in_step(ZERO_SHOT, task, step), make_roles(ZERO_SHOT)
     roles.demonstrated.fill_(True)
-    torch.testing.assert_close(roles.positions(*seen)[:, 0], way(seen[0]))
+    way = seen[0][:, target] - seen[0][:, moved] + torch.tensor([beside, 0.0, 0.0])
+    torch.testing.assert_close(roles.positions(*seen)[:, 0], way)
 
 
-@pytest.mark.parametrize(
-    ("task", "step", "direction"),
-    [("push", 0, (0.0, 0.0, 0.0)), ("drawer-open", 2, (0.0, -1.0, 0.0)), ("window-open", 2, (1.0, 0.0, 0.0)),
-     ("window-open", 0, (1.0, 0.0, 0.0)), ("button-press-topdown", 2, (0.0, 0.0, -1.0))],
-)  # fmt: skip
+DIRECTIONS = [("push", 0, (0.0, 0.0, 0.0)), ("drawer-open", 2, (0.0, -1.0, 0.0)), ("window-open", 2, (1.0, 0.0, 0.0))]
+DIRECTIONS += [("window-open", 0, (1.0, 0.0, 0.0)), ("button-press-topdown", 2, (0.0, 0.0, -1.0))]
+
+
+@pytest.mark.parametrize(("task", "step", "direction"), DIRECTIONS)
 def test_direction_of_a_step(task, step, direction):
     roles, seen = make_roles(), in_step(CANONICAL, task, step)
     assert torch.equal(roles.directions(*seen), torch.tensor(direction).expand(5, 3))
     assert torch.equal(written(roles, seen)[:, 9:], torch.tensor(direction).expand(5, 3))
 
 
-def test_direction_to_the_goal_starts_at_the_object_and_turns_with_the_scene():
-    pairs = [
-        ("gripper is not near the puck", "lower the gripper beside the puck"),
-        ("gripper is near the puck", "push the puck to the target location"),
-    ]
+def push_plan(verb, *pairs):
+    """Return a canonical plan of push, and the number of its step with a verb."""
     plans = lw.canonical_plans(Plans([ConditionalPlan.from_pairs("push", pairs)]))
-    (number,) = (n for n, step in enumerate(plans["push"].steps) if step.role.verb == "push")
+    return plans, [step.role.verb for step in plans["push"].steps].index(verb)
+
+
+def turned_by_any_angle(observation):
+    return lw.RandomYaw(0.7)(TensorDict(observation=observation, action=torch.zeros(5, 4), batch_size=[5]))
+
+
+def test_direction_to_the_goal_starts_at_the_object_and_turns_with_the_scene():
+    push = ("gripper is near the puck", "push the puck to the target location")
+    plans, number = push_plan("push", ("gripper is not near the puck", "lower the gripper beside the puck"), push)
     roles, (observation, weights, rows) = make_roles(plans), in_step(plans, "push", number)
     ahead = torch.nn.functional.normalize(observation[:, 36:39] - observation[:, 4:7], dim=-1)
     torch.testing.assert_close(roles.directions(observation, weights, rows), ahead)
-    turned = lw.RandomYaw(0.7)(TensorDict(observation=observation, action=torch.zeros(5, 4), batch_size=[5]))
-    yaw = turned["observation_yaw"]
-    after = roles.directions(turned["observation"], weights, rows, yaw)
+    turned = turned_by_any_angle(observation)
+    after = roles.directions(turned["observation"], weights, rows, turned["observation_yaw"])
     now = torch.nn.functional.normalize(turned["observation"][:, 36:39] - turned["observation"][:, 4:7], dim=-1)
     torch.testing.assert_close(after, now)
     observation[:, 36:39] = observation[:, 4:7]
@@ -158,13 +160,9 @@ def test_direction_to_the_goal_starts_at_the_object_and_turns_with_the_scene():
 
 
 def test_object_that_is_lifted_has_a_target_above_it():
-    pairs = [
-        ("gripper is not near the puck", "lower the gripper around the puck"),
-        ("gripper is near the puck and gripper is open", "close the gripper around the puck"),
-        ("gripper is near the puck and gripper is closed", "lift the puck"),
-    ]
-    plans = lw.canonical_plans(Plans([ConditionalPlan.from_pairs("push", pairs)]))
-    (number,) = (n for n, step in enumerate(plans["push"].steps) if step.role.verb == "move")
+    lower = ("gripper is not near the puck", "lower the gripper around the puck")
+    close = ("gripper is near the puck and gripper is open", "close the gripper around the puck")
+    plans, number = push_plan("move", lower, close, ("gripper is near the puck and gripper is closed", "lift the puck"))
     seen = in_step(plans, "push", number)
     torch.testing.assert_close(make_roles(plans).positions(*seen)[:, 0], torch.tensor([0.0, 0.0, 0.15]).expand(5, 3))
     assert not make_roles(plans).directions(*seen).any()
@@ -182,25 +180,14 @@ def test_position_is_clipped_at_25_cm():
     torch.testing.assert_close(written(roles, (observation, *rest))[:, 0], torch.full((5,), -1.0))
 
 
-def carried(beside, below):
-    """Return one row in which the puck is carried, some metres beside and below its target."""
-    observation, weights, rows = in_step(CANONICAL, "push", 3, number=1)
-    observation[:, 4:7] = observation[:, 36:39] - torch.tensor([beside, 0.0, below])
-    return observation, weights, rows
+LIFTED = [(0.2, 0.0, (0.0, 0.0, 0.15)), (0.2, -0.13, (0.2, 0.0, 0.02))]  # far away: straight up first; high: aside
+LIFTED += [(0.2, -0.11, (0.1, 0.0, 0.04)), (0.02, -0.15, (0.02, 0.0, -0.15)), (0.0, 0.0, (0.0, 0.0, 0.0))]  # both; down
 
 
-@pytest.mark.parametrize(
-    ("beside", "below", "expected"),
-    [
-        (0.2, 0.0, (0.0, 0.0, 0.15)),  # far away: straight up first
-        (0.2, -0.13, (0.2, 0.0, 0.02)),  # high: to the side
-        (0.2, -0.11, (0.1, 0.0, 0.04)),  # in between: both
-        (0.02, -0.15, (0.02, 0.0, -0.15)),  # over it: down
-        (0.0, 0.0, (0.0, 0.0, 0.0)),
-    ],
-)
+@pytest.mark.parametrize(("beside", "below", "expected"), LIFTED)
 def test_without_demonstrations_a_carried_object_is_lifted_first(beside, below, expected):
-    roles, seen = make_roles(), carried(beside, below)
+    roles, seen = make_roles(), in_step(CANONICAL, "push", 3, number=1)
+    seen[0][:, OBJECT] = seen[0][:, GOAL] - torch.tensor([beside, 0.0, below])
     torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor(expected), atol=1e-5, rtol=0)
     roles.fit(rows_of(CANONICAL, in_step(CANONICAL, "push", 0)))
     assert roles.demonstrated.tolist() == [task == "push" for task in roles.tables.index.tasks]
@@ -216,10 +203,8 @@ def test_a_sliding_object_is_not_lifted():
 
 
 def demonstrations(task):
-    env = lw.LanguageWorldEnv(task, num_envs=2)
-    rows = env.rollout(160, lw.ExpertActor(task), break_when_any_done=False).flatten()
-    env.close()
-    return rows.select("observation", "task_id", "action")
+    rows = lw.LanguageWorldEnv(task, num_envs=2).rollout(160, lw.ExpertActor(task), break_when_any_done=False)
+    return rows.flatten().select("observation", "task_id", "action")
 
 
 def test_contact_is_the_hand_position_while_it_acts():
@@ -230,7 +215,7 @@ def test_contact_is_the_hand_position_while_it_acts():
     roles = make_roles()
     roles.fit(rows)
     attended = PlanAttention(CANONICAL)(lw.QAFTransform(CANONICAL)(rows.copy()))["skill_weights"]
-    (pull,) = (n for n, step in enumerate(CANONICAL["drawer-open"].steps) if step.role.verb == "pull")
+    pull = [step.role.verb for step in CANONICAL["drawer-open"].steps].index("pull")
     observation = rows["observation"][attended[:, pull] > 0.5]
     assert 10 < len(observation) < len(rows)
     row = row_of(CANONICAL, "drawer-open")
@@ -258,12 +243,10 @@ def test_turned_scene_turns_positions_fixed_places_and_contacts(task, step):
     roles = make_roles()
     roles.contact.copy_(torch.rand(roles.contact.shape))
     observation, weights, rows = in_step(CANONICAL, task, step)
-    sample = TensorDict(observation=observation, action=torch.zeros(5, 4), batch_size=[5])
-    turned = lw.RandomYaw(0.7)(sample)
+    turned = turned_by_any_angle(observation)
     yaw = turned["observation_yaw"]
-    before = roles.positions(observation, weights, rows)[:, 0]
+    x, y, z = roles.positions(observation, weights, rows)[:, 0].unbind(-1)
     after = roles.positions(turned["observation"], weights, rows, yaw)[:, 0]
-    x, y, z = before.unbind(-1)
     turned_by_hand = torch.stack([yaw.cos() * x - yaw.sin() * y, yaw.sin() * x + yaw.cos() * y, z], -1)
     torch.testing.assert_close(after, turned_by_hand)
 
@@ -298,8 +281,7 @@ def test_training_fits_contacts_that_actors_with_the_same_weights_and_the_policy
         fit_normalization(each, replay)
     for each in (actor, back, loaded, *copies, *ensemble.members):
         assert torch.equal(each.features.contact, contact)
-    for each in (actor, wider, back, loaded):
-        features = each.features
+    for features in (each.features for each in (actor, wider, back, loaded)):
         assert features.fitted
         assert features.demonstrated.tolist() == [task == "drawer-open" for task in features.tables.index.tasks]
         assert features.contact.count_nonzero() == 3

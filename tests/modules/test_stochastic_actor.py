@@ -1,5 +1,7 @@
 """StochasticActor: TorchRL's sampling on our trunks, as a copy of a trained actor."""
 
+from functools import partial
+
 import pytest
 import torch
 from small_actors import CANONICAL, make_actor, make_descriptor, make_role_actor, make_rows
@@ -11,10 +13,8 @@ from lw_torchrl.modules import Concat, FocusFeatures, ObservationFeatures, RoleF
 
 def trained(kind="plan", **options):
     """Return a deterministic actor with fitted statistics and noisy features."""
-    if kind == "plan":
-        actor = make_actor(features=ObservationFeatures(noise=0.3), **options)
-    else:
-        actor = make_descriptor(condition=kind, features=ObservationFeatures(noise=0.3), **options)
+    make = make_actor if kind == "plan" else partial(make_descriptor, condition=kind)
+    actor = make(features=ObservationFeatures(noise=0.3), **options)
     actor.features.fit(make_rows(50, seed=9))
     return actor
 

@@ -21,9 +21,7 @@ PLAIN = TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["a
 def with_effort(actor, effort):
     """Return the actor with a constant effort."""
     *_, last = (part for part in actor.decoder.modules() if isinstance(part, nn.Linear))
-    with torch.no_grad():
-        last.weight[3] = 0.0
-        last.bias[3] = torch.atanh(torch.tensor(effort))
+    last.weight.data[3], last.bias.data[3] = 0.0, torch.atanh(torch.tensor(effort))
     return actor.eval()
 
 
@@ -89,11 +87,8 @@ PUCK = lw.Task("seven/push", "Push it.", (NamedObject(GRIPPER, (1, 2, 3)), Named
 
 
 def seven_plans():
-    pairs = [
-        ("the gripper is not above the puck", "place the gripper above the puck"),
-        ("the gripper is above the puck", "lower the gripper around the puck"),
-        ("the gripper is near the puck", "close the gripper around the puck"),
-    ]
+    lower = ("the gripper is above the puck", "lower the gripper around the puck")
+    pairs = [lower, ("the gripper is near the puck", "close the gripper around the puck")]
     return lw.canonical_plans(Plans([ConditionalPlan.from_pairs(PUCK, pairs)]))
 
 
@@ -111,10 +106,8 @@ def test_gripper_of_another_robot_is_decided_by_the_first_robots_effort(effort, 
 
 
 def test_layout_places_the_effort():
-    actions = torch.zeros(2, 7)
-    actions[0, 6] = -0.5
-    assert decided(actions, SEVEN)[:, 6].tolist() == [-1.0, 1.0]
-    assert not decided(actions, SEVEN)[:, :6].any()
+    actions = torch.tensor([[0.0] * 6 + [-0.5], [0.0] * 7])
+    assert decided(actions, SEVEN).tolist() == [[0] * 6 + [-1], [0] * 6 + [1]]
     assert actions[0, 6] == -0.5
 
 

@@ -42,13 +42,11 @@ def test_loss_by_hand(kind, name, distribution):
     actor, batch = make_actor(kind, distribution), make_batch()
     loss = lw.objectives.AdvantageWeightedLoss(actor, beta=1.5, max_weight=5.0, loss_function=name)
     actions = actor(batch.copy())["action"].double().tolist()
-    total, weights, clipped = 0.0, [], 0
-    for row in range(len(batch)):
-        exponential = math.exp(1.5 * batch["advantage"][row].item())
-        clipped += exponential > 5.0
-        weights.append(min(exponential, 5.0))
+    exponentials = [math.exp(1.5 * advantage) for advantage in batch["advantage"].flatten().tolist()]
+    weights, clipped, total = [min(each, 5.0) for each in exponentials], sum(each > 5.0 for each in exponentials), 0.0
+    for row in range(12):
         off = [distance(a, b, name) for a, b in zip(actions[row], batch["action"][row].tolist(), strict=True)]
-        total += weights[-1] * sum(off) / 4
+        total += weights[row] * sum(off) / 4
     result = loss(batch)
     np.testing.assert_allclose(result["loss_actor"].item(), total / sum(weights), rtol=1e-5)
     np.testing.assert_allclose(result["weight_clipped"].item(), clipped / 12, rtol=1e-6)

@@ -137,9 +137,8 @@ def test_renamed_and_nested_keys():
     other.set_keys(**names)
     batch = make_batch()
     new = {"reward": "gain", "done": "over", "terminated": "dead", "steps_to_next_obs": "n"}
-    own, ahead = (
-        {new.get(key, key): rows[key] for key in rows.keys()} for rows in (batch.exclude("next"), batch["next"])
-    )
+    parts = batch.exclude("next"), batch["next"]
+    own, ahead = ({new.get(key, key): value for key, value in rows.items()} for rows in parts)
     renamed = TensorDict(agent=own, next={"agent": ahead}, batch_size=[12])
     assert torch.equal(other(renamed)["loss_value"], plain(batch)["loss_value"])
     assert torch.equal(renamed["urgency"], batch["td_error"])
@@ -171,8 +170,8 @@ def test_input_gains_only_td_error():
     loss.advantage(batch)
     assert (batch == before).all()
     loss(batch)
-    assert "td_error" in batch.keys()
-    assert (batch.exclude("td_error") == before).all()
+    assert (batch.pop("td_error") >= 0).all()
+    assert (batch == before).all()
 
 
 def test_other_estimators():

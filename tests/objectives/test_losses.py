@@ -3,6 +3,7 @@
 import copy
 import os
 import warnings
+from functools import partial
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ from lw_torchrl.objectives import with_n_steps
 PLANS = lw.load_plans("MT10")
 SMALL = dict(width=16, depth=1)
 BOUNDS = {"bounds": (-torch.ones(4), torch.ones(4))}
+quantiles = lambda q: QValue(q.trunk, quantiles=5, **SMALL).to(device_of(q))  # noqa: E731
 DETERMINISTIC = {
     "BC": lambda actor, q, v: o.BCLoss(actor),
     "DDPG": lambda actor, q, v: o.DDPGLoss(actor, q),
@@ -36,9 +38,7 @@ STOCHASTIC = {
     "CrossQ": lambda actor, q, v: o.CrossQLoss(actor, q),
     "IQL": lambda actor, q, v: o.IQLLoss(actor, q, v),
     "CQL": lambda actor, q, v: o.CQLLoss(actor, q, action_spec=actor.spec["action"]),
-    "TQC": lambda actor, q, v: o.TQCLoss(
-        actor, QValue(q.trunk, quantiles=5, **SMALL).to(device_of(q)), num_qvalue_nets=2
-    ),
+    "TQC": lambda actor, q, v: o.TQCLoss(actor, quantiles(q), num_qvalue_nets=2),
 }
 ON_POLICY = {
     "A2C": lambda actor, q, v: o.A2CLoss(actor, v),
@@ -52,10 +52,8 @@ CONDITIONS = ("plan", "description", "one-hot")
 
 def make_actor(condition, distribution=None, noise=0.05, **options):
     parts = {"decoder": MLPDecoder(**SMALL), "features": ObservationFeatures(noise=noise), **options}
-    if condition == "plan":
-        actor = lw.PlanConditionedActor(PLANS, **parts)
-    else:
-        actor = lw.modules.DescriptorConditionedActor("MT10", condition=condition, **parts)
+    kind = partial(lw.modules.DescriptorConditionedActor, condition=condition)
+    actor = lw.PlanConditionedActor(PLANS, **parts) if condition == "plan" else kind("MT10", **parts)
     return actor if distribution is None else actor.stochastic(distribution)
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from small_training import PLANS, assert_same, make_parts
 from tensordict import TensorDict
 from torch import nn
 from torch.nn.utils import prune
@@ -16,17 +17,14 @@ from lw_torchrl._util.reproducibility import package_versions
 from lw_torchrl._util.tensor_files import read_tensors, write_tensors
 from lw_torchrl.language import text
 from lw_torchrl.language.skills import load_skills
-from lw_torchrl.modules import ActorEnsemble, MLPDecoder, SkillEncoder
+from lw_torchrl.modules import ActorEnsemble
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.training import save_evaluator
 from lw_torchrl.training.checkpoint import read_description
 
-PLANS = lw.load_plans("MT10")
-
 
 def small(plans=PLANS, **options):
-    parts = {"skill_encoder": SkillEncoder(4, width=8), "decoder": MLPDecoder(width=16, depth=1)}
-    return lw.PlanConditionedActor(plans, **{**parts, **options})
+    return lw.PlanConditionedActor(plans, **make_parts(), **options)
 
 
 def count_vowels(texts):
@@ -48,9 +46,8 @@ def train(actor, path, plans=PLANS):
     return actor
 
 
-def own_plans():
-    pairs = [("the gripper is open", "move the gripper to the reach target"), ("the gripper is closed", 'say "well"')]
-    return lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs[:1]), lw.ConditionalPlan.from_pairs("reach", pairs)])
+PAIRS = [("the gripper is open", "move the gripper to the reach target"), ("the gripper is closed", 'say "well"')]
+OWN = lw.Plans([lw.ConditionalPlan.from_pairs("push", PAIRS[:1]), lw.ConditionalPlan.from_pairs("reach", PAIRS)])
 
 
 def act(actor, plans=PLANS):
@@ -73,10 +70,10 @@ def path(tmp_path):
 
 
 def test_custom_plans_are_stored_and_the_text_encoder_is_passed_again(path):
-    actor = train(small(own_plans(), text_encoder=count_vowels), path, own_plans())
+    actor = train(small(OWN, text_encoder=count_vowels), path, OWN)
     loaded = lw.load_actor(path, text_encoder=count_vowels)
-    assert loaded.plans == own_plans()
-    assert torch.equal(act(loaded, own_plans()), act(actor, own_plans()))
+    assert loaded.plans == OWN
+    assert torch.equal(act(loaded, OWN), act(actor, OWN))
     lw.load_actor(path, text_encoder=lambda texts: count_vowels(texts) * 3.0)  # the same after scaling
     for encoder in (lambda texts: count_vowels(texts).flip(-1), lambda texts: torch.ones(len(texts), 3), None):
         with pytest.raises(ValueError, match="text_encoder"):
@@ -87,7 +84,7 @@ def test_custom_plans_are_stored_and_the_text_encoder_is_passed_again(path):
 def test_policies_with_texts_that_are_not_shipped_load_in_a_new_process(kind, path):
     other = replace(lw.TASKS["reach"], description="Bring the hand over to the red spot.")
     is_description = kind == "description"
-    actor = lw.modules.DescriptorConditionedActor([other]) if is_description else ActorEnsemble([small(own_plans())])
+    actor = lw.modules.DescriptorConditionedActor([other]) if is_description else ActorEnsemble([small(OWN)])
     lw.save_actor(actor, path)
     text._sentence_transformer.cache_clear()  # as in a new process
     lw.load_actor(path)
@@ -97,10 +94,10 @@ def test_policies_with_texts_that_are_not_shipped_load_in_a_new_process(kind, pa
 @pytest.mark.parametrize("other", [lambda actor: actor, lambda actor: actor.with_plans(PLANS)])
 def test_an_ensemble_whose_members_share_weights_is_rebuilt(path, other):
     actor = small()
-    ensemble = ActorEnsemble([actor, other(actor)])
+    ensemble, before = ActorEnsemble([actor, other(actor)]), torch.get_rng_state()
     lw.save_actor(ensemble, path)
-    loaded = lw.load_actor(path).state_dict()
-    assert all(torch.equal(value, loaded[name]) for name, value in ensemble.state_dict().items())
+    assert torch.equal(torch.get_rng_state(), before), "saving draws no random numbers"
+    assert_same(dict(lw.load_actor(path).state_dict()), dict(ensemble.state_dict()))
 
 
 def test_scripted_skills_are_rebuilt_unless_they_are_custom(path, tmp_path):
@@ -121,12 +118,9 @@ def test_a_loaded_actor_outlives_the_file_and_can_be_trained(saved, path):
     torch.optim.SGD(loaded.parameters(), 0.1).step()
 
 
-def test_any_safetensors_reader_reads_the_weights(saved):
+def test_any_reader_reads_the_weights_and_the_description_records_architecture_training_and_versions(saved, path):
     weights = load_file(saved[0])
     assert all(torch.equal(value, weights[name]) for name, value in saved[1].state_dict().items())
-
-
-def test_the_description_records_architecture_training_and_versions(saved, path):
     description = read_description(saved[0])
     assert description["actor"] == describe(saved[1])
     assert (description["training"]["steps"], description["data"]) == (5, None)
@@ -153,13 +147,6 @@ def test_an_actor_that_could_not_be_loaded_is_not_saved(tmp_path, path, message)
         with pytest.raises(ValueError, match=f"actor cannot be saved, .*{message}"):
             write(actor, path)
     assert not list(tmp_path.iterdir())
-
-
-def test_saving_draws_no_random_numbers(path):
-    actor = small()
-    before = torch.get_rng_state()
-    lw.save_actor(actor, path)
-    assert torch.equal(torch.get_rng_state(), before)
 
 
 # ---- other files and damaged ones

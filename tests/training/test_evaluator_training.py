@@ -1,15 +1,17 @@
-"""A StateQueryEvaluator learns the exact answers to queries, and generalises to held-out ones."""
+"""Query evaluators learn the exact answers to queries, from states and from pictures."""
 
 import json
 from dataclasses import replace
 
 import pytest
 import torch
+from pictures import why_no_pictures
 from small_training import CONFIG, assert_same, flat, make_actor
 from tensordict.nn import TensorDictSequential
 
 import lw_torchrl as lw
 from lw_torchrl.evaluation import score_evaluator
+from lw_torchrl.evaluation.evaluator_score import clause_logits
 
 PLANS = lw.load_plans("MT10")
 SMALL = lw.training.QueryEvaluatorConfig(steps=12, batch_size=64, checkpoint_every=5)
@@ -39,20 +41,17 @@ def everything(trainer):
     return flat({"weights": dict(trainer.evaluator.state_dict()), "optimizer": trainer.optimizer.state_dict()})
 
 
-def pairs_of(part):
-    clauses = [clause for queries in part for clause in queries.clauses]
-    return {tuple(sorted((clause.subject, clause.object or ""))) for clause in clauses}
-
-
 def test_held_out_data_are_not_in_the_training_data(replay):
     config = lw.training.QueryEvaluatorConfig(held_out_tasks=("reach",), held_out_pairs=0.3, seed=3)
     parts = (data := lw.training.LabelledQueries(replay, config)).parts
     assert (data.tasks, data.held_out_tasks) == (("drawer-open", "push"), ("reach",))
     assert all(parts[part] for part in PARTS)
     assert {queries.task.name for queries in parts["tasks"]} == {"reach"}
-    assert pairs_of(parts["queries"]) == {*data.held_out_pairs}
-    assert pairs_of(parts["queries"]).isdisjoint(pairs_of(parts["training"]))
-    predicates = {part: {clause.predicate for each in parts[part] for clause in each.clauses} for part in PARTS}
+    clauses = {part: [clause for each in parts[part] for clause in each.clauses] for part in PARTS}
+    pairs = {part: {tuple(sorted((each.subject, each.object or ""))) for each in clauses[part]} for part in PARTS}
+    assert pairs["queries"] == {*data.held_out_pairs}
+    assert pairs["queries"].isdisjoint(pairs["training"])
+    predicates = {part: {clause.predicate for clause in clauses[part]} for part in PARTS}
     assert predicates["queries"] <= predicates["training"]
     states = {part: {tuple(row) for each in parts[part] for row in each.observation.tolist()} for part in PARTS}
     assert states["training"].isdisjoint(states["states"] | states["queries"])
@@ -114,18 +113,13 @@ def test_interrupted_training_resumes_bit_for_bit_and_another_one_is_refused(rep
     loaded = lw.training.load_evaluator(path, PLANS)
     assert not loaded.training
     assert_same(flat(dict(loaded.state_dict())), flat(dict(whole.evaluator.state_dict())))
+    wider = lw.training.load_evaluator(path, lw.load_plans("MT50"))
+    assert wider.plans == lw.load_plans("MT50")
+    assert torch.equal(wider.network.trunk[0].weight, loaded.network.trunk[0].weight)
     with pytest.raises(ValueError, match=r"its training differs in .*batch_size"):
         make_trainer(replay, path, config=replace(SMALL, batch_size=32))
     with pytest.raises(ValueError, match=r"its evaluator differs in .*width"):
         make_trainer(replay, path, width=17)
-
-
-def test_an_evaluator_is_loaded_for_any_plans(tmp_path):
-    evaluator = make()
-    lw.training.save_evaluator(evaluator, tmp_path / "e.safetensors", note="mine")
-    loaded = lw.training.load_evaluator(tmp_path / "e.safetensors", lw.load_plans("MT50"))
-    assert loaded.plans.fingerprint == lw.load_plans("MT50").fingerprint
-    assert torch.equal(loaded.network.trunk[0].weight, evaluator.network.trunk[0].weight)
 
 
 # ---- imitation that also trains an evaluator
@@ -147,7 +141,56 @@ def test_the_anchor_keeps_the_answers_exact(demos):
 
     free, anchored = trainer(0.0), trainer(1.0)
     before = agreement(free)
-    for trainer in (free, anchored):
-        trainer.train()
-    assert agreement(anchored) > max(before, agreement(free)) + 0.1
-    assert agreement(anchored) > 0.9
+    free.train()
+    anchored.train()
+    assert agreement(anchored) > max(before + 0.1, agreement(free) + 0.1, 0.9)
+
+
+TWO = lw.Plans({task: PLANS[task] for task in ("drawer-open", "reach")})
+PICTURES = {"cameras": ("corner", "corner3"), "height": 24, "width": 24}
+SEEING = lw.training.ImageQueryEvaluatorConfig(steps=6, batch_size=8, checkpoint_every=2, held_out_pairs=0.0)
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory):
+    if missing := why_no_pictures():
+        pytest.skip(missing)
+    root = tmp_path_factory.mktemp("states") / "demos"
+    lw.collect_demonstrations([*TWO], episodes_per_task=3, root=root, max_steps=60, progress=False)
+    lw.data.add_pictures(root, **PICTURES, every=5, progress=False)
+    replay = lw.LanguageWorldExperienceReplay(root, label="executed")
+    replay.add_column("pixels", lw.data.load_pictures(replay, **PICTURES, every=5))
+    return replay
+
+
+@pytest.mark.slow
+def test_it_learns_positions_and_answers(seen):
+    config = replace(SEEING, steps=900, batch_size=16, learning_rate=3e-3, held_out_states=0.0)
+    data = lw.training.LabelledQueries(seen, config)
+
+    def right(evaluator):
+        with torch.no_grad():
+            answers = [clause_logits(evaluator, queries) for queries in data.parts["training"]]
+        return torch.stack([((logits > 0) == truth).float().mean() for logits, truth in answers])
+
+    torch.manual_seed(0)
+    evaluator = lw.modules.ImageQueryEvaluator(TWO, **PICTURES, hidden=16, depth=1)
+    before = right(evaluator)
+    lw.training.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
+    assert (right(evaluator) > before + 0.15).all()
+    for queries in data.parts["training"]:
+        with torch.no_grad():
+            places, _ = evaluator.network.places(queries.pixels, evaluator.network.names.weight)
+        hand, true = places[:, evaluator.names.index("robot's gripper"), :3], queries.observation[:, :3]
+        assert (hand - true).norm(dim=-1).median() < 0.6 * (true.mean(0) - true).norm(dim=-1).median()
+
+
+def test_only_states_with_their_own_picture_are_used(seen):
+    data = lw.training.LabelledQueries(seen, SEEING)
+    states = sum(len(queries.observation) for part in ("training", "states") for queries in data.parts[part])
+    assert states == 2 * 3 * 12  # tasks, episodes, 60 steps at 5 apart
+    sparse = lw.LanguageWorldExperienceReplay(seen.root, label="executed")
+    pictures = lw.data.load_pictures(sparse, **PICTURES, every=5)
+    sparse.add_column("pixels", pictures[torch.arange(len(sparse)) // 20 * 20])
+    with pytest.raises(ValueError, match="every"):
+        lw.training.LabelledQueries(sparse, SEEING)

@@ -17,10 +17,8 @@ PLANS = lw.load_plans("MT10")
 
 @pytest.fixture(scope="module")
 def replay():
-    generator = torch.Generator().manual_seed(0)
-    rows = TensorDict(observation=torch.randn(50, 39, generator=generator) * 3 + 1).auto_batch_size_(1)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(50), batch_size=8)
-    buffer.extend(rows)
+    buffer.extend(TensorDict(observation=torch.randn(50, 39) * 3 + 1, batch_size=[50]))
     return buffer
 
 
@@ -39,15 +37,11 @@ def make(kind="differences", distribution=None):
     return actor, *(critic(PLANS, features=ObservationFeatures(kind), width=8, depth=1) for critic in critics)
 
 
-def losses(kind="differences"):
-    bounds = (-torch.ones(4), torch.ones(4))
-    actor, q, _ = make(kind)
-    yield DDPGLoss(actor, q, delay_actor=True)
-    actor, q, _ = make(kind)
-    yield TD3Loss(actor, q, bounds=bounds)
-    for loss in (SACLoss, REDQLoss, lambda *networks: CQLLoss(*networks, action_spec=networks[0].spec["action"])):
-        actor, q, _ = make(kind, "tanh_normal")
-        yield loss(actor, q)
+def losses(kind):
+    yield DDPGLoss(*make(kind)[:2], delay_actor=True)
+    yield TD3Loss(*make(kind)[:2], bounds=(-torch.ones(4), torch.ones(4)))
+    for loss in (SACLoss, REDQLoss, lambda actor, q: CQLLoss(actor, q, action_spec=actor.spec["action"])):
+        yield loss(*make(kind, "tanh_normal")[:2])
     yield IQLLoss(*make(kind, "normal"))
 
 
@@ -84,9 +78,8 @@ def test_rows_may_be_in_a_list_and_in_double_precision(replay, expected):
 def test_role_features_in_a_loss_are_fitted_with_their_contact_points():
     plans = lw.canonical_plans(PLANS)
     generator = torch.Generator().manual_seed(0)
-    rows = TensorDict(
-        observation=0.1 * torch.rand(200, 39, generator=generator), task_id=torch.full((200,), lw.task_id("push"))
-    ).auto_batch_size_(1)
+    rows = TensorDict(observation=0.1 * torch.rand(200, 39, generator=generator)).auto_batch_size_(1)
+    rows["task_id"] = torch.full((200,), lw.task_id("push"))
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(200), batch_size=8)
     buffer.extend(rows)
     expected = RoleFeatures(plans)

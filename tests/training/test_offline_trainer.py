@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -38,14 +39,11 @@ def make_value(noise, ensemble=1):
     return lw.PlanConditionedValue(PLANS, ensemble=ensemble, features=features, **CRITIC)
 
 
-def make_qvalue():
-    return lw.PlanConditionedQValue(PLANS, **CRITIC)
-
-
 def make_sac(loss, noise, **options):
     return loss(make_actor(noise, "tanh_normal"), make_qvalue(), **options)
 
 
+make_qvalue = partial(lw.PlanConditionedQValue, PLANS, **CRITIC)
 LOSSES = {
     "bc": lambda noise: bc_loss(make_actor(noise), "l2"),
     "value": lambda noise: lw.objectives.ExpectileValueLoss(make_value(noise, ensemble=2)),
@@ -56,6 +54,7 @@ LOSSES = {
     "sac": lambda noise: make_sac(SACLoss, noise),
     "redq": lambda noise: make_sac(REDQLoss, noise, num_qvalue_nets=2, sub_sample_len=2),
 }
+NAMES = [name if name == "td3-bc" else pytest.param(name, marks=pytest.mark.slow) for name in LOSSES]
 
 
 def make_loss(name, seed=0, noise=0.05):
@@ -85,9 +84,7 @@ def everything(trainer):
     return flat([tensors_of(trainer.loss), trainer.optimizer.state_dict(), trainer.minibatches[0].state_dict()])
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "td3-bc" else pytest.param(name, marks=pytest.mark.slow) for name in LOSSES]
-)
+@pytest.mark.parametrize("name", NAMES)
 def test_interrupted_training_resumes_bit_for_bit(demos, tmp_path, name):
     uninterrupted = make_trainer(demos, name)
     uninterrupted.train()
@@ -260,10 +257,9 @@ def test_a_buffer_of_other_plans_is_refused(demos):
 def test_augmentations_that_features_would_not_see_are_refused(demos, name):
     plans = lw.canonical_plans(PLANS)
     augmented = {"RandomYaw": lw.RandomYaw(0.3), "JitterTarget": lw.transforms.JitterTarget(plans, 0.03)}[name]
-    critics = [lw.PlanConditionedValue(plans, features=kind(plans), **CRITIC) for kind in (FocusFeatures, RoleFeatures)]
     actor = lw.PlanConditionedActor(plans, **make_parts()).stochastic("normal")
-    for value in critics:
-        replay = make_replay(demos, plans)
+    for kind in (FocusFeatures, RoleFeatures):
+        value, replay = lw.PlanConditionedValue(plans, features=kind(plans), **CRITIC), make_replay(demos, plans)
         replay.append_transform(augmented)
         iql = IQLLoss(actor, lw.PlanConditionedQValue(plans, **CRITIC), value)
         iql.make_value_estimator(gamma=GAMMA)

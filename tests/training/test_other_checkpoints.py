@@ -68,17 +68,12 @@ def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
     assert_refused(checkpoint, message, lambda: make_trainer(root, checkpoint))
 
 
-@pytest.mark.parametrize(
-    ("change", "difference"),
-    [
-        (dict(label="unclipped"), "label"),
-        (dict(after_success=0), "rows"),
-        (dict(sampler=RandomSampler), "sampler"),
-        (dict(yaw=0.2), "transforms"),
-        (dict(yaw=None), "transforms"),
-        (dict(plans=PLANS), "transforms"),
-    ],
-)
+CHANGES = [(dict(label="unclipped"), "label"), (dict(after_success=0), "rows")]
+CHANGES += [(dict(sampler=RandomSampler), "sampler"), (dict(plans=PLANS), "transforms")]
+CHANGES += [(dict(yaw=0.2), "transforms"), (dict(yaw=None), "transforms")]
+
+
+@pytest.mark.parametrize(("change", "difference"), CHANGES)
 def test_a_checkpoint_of_other_samples_is_refused(long_demos, tmp_path, change, difference):
     path = tmp_path / "c.safetensors"
 
@@ -94,15 +89,12 @@ def test_a_checkpoint_of_other_samples_is_refused(long_demos, tmp_path, change, 
     assert_refused(path, f"a different configuration: its replay differs in {difference}", lambda: trainer(**change))
 
 
-def test_a_file_of_another_program_is_refused(demos, tmp_path):
+def test_a_file_of_another_program_or_without_a_state_is_refused(demos, checkpoint, tmp_path):
     path, state, content = tmp_path / "thesis.tex", tmp_path / "thesis.training.tex", b"years of work\n"
     path.write_bytes(content)
     assert_refused(path, "exists, but its training state .* does not", lambda: make_trainer(demos, path))
     state.write_bytes(content)
     assert_refused(state, "corrupted or not a .safetensors file", lambda: make_trainer(demos, path))
-
-
-def test_a_training_file_without_a_state_is_refused(demos, checkpoint, tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     description, tensors = read_tensors(training_file(checkpoint))
     del description["state"]
@@ -126,9 +118,8 @@ def test_one_training_at_a_time_writes_a_checkpoint(demos, tmp_path, holding, mo
     assert {file.name for file in tmp_path.iterdir()} == {"policy.safetensors", "policy.training.safetensors"}
     assert make_trainer(demos, path).steps == CONFIG.steps
     real = importlib.metadata.version
-    monkeypatch.setattr(
-        "lw_torchrl._util.reproducibility.version", lambda name: "9.9.9" if name == "torch" else real(name)
-    )
+    other = lambda name: "9.9.9" if name == "torch" else real(name)  # noqa: E731
+    monkeypatch.setattr("lw_torchrl._util.reproducibility.version", other)
     with pytest.warns(UserWarning, match=r"with other versions \(torch .*, now 9.9.9\)") as caught:
         make_trainer(demos, path)
     assert len(caught) == 1

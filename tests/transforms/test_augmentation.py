@@ -17,17 +17,17 @@ MT10 = lw.load_plans("MT10")
 CANONICAL = lw.canonical_plans(MT10, fallback=True)
 
 
-@pytest.mark.parametrize(
-    ("task", "condition", "skill", "objects"),
-    [
-        ("push", "the gripper is above the puck", "lower the gripper", [1, 0, 0]),
-        ("push", "the gripper is open", "move the puck to the target location", [1, 0, 1]),
-        ("push", "the gripper is open", "wait", [0, 0, 0]),
-        ("hammer", "the gripper is above the hammer handle", "wait", [1, 0, 0]),  # a named point of the first object
-        ("hammer", "the hammer head is near the nail", "wait", [1, 1, 0]),
-        ("bin-picking", "the gripper is above the other bin", "wait", [0, 0, 0]),  # a fixed place
-    ],
-)
+MENTIONED = [
+    ("push", "the gripper is above the puck", "lower the gripper", [1, 0, 0]),
+    ("push", "the gripper is open", "move the puck to the target location", [1, 0, 1]),
+    ("push", "the gripper is open", "wait", [0, 0, 0]),
+    ("hammer", "the gripper is above the hammer handle", "wait", [1, 0, 0]),  # a named point of the first object
+    ("hammer", "the hammer head is near the nail", "wait", [1, 1, 0]),
+    ("bin-picking", "the gripper is above the other bin", "wait", [0, 0, 0]),  # a fixed place
+]
+
+
+@pytest.mark.parametrize(("task", "condition", "skill", "objects"), MENTIONED)
 def test_conditions_and_skills_mention_objects(task, condition, skill, objects):
     plans = Plans([ConditionalPlan.from_pairs(task, [(condition, skill), ("the gripper is open", "wait")])])
     assert mentioned(plans, PlanTables(plans))[0].int().tolist() == [objects, [0, 0, 0]]
@@ -53,9 +53,8 @@ KEPT = torch.tensor([[True, False, False], [True, False, True]])
 
 def rows(number=8, seed=0, plans=PUSH, task="push", step=None):
     generator = torch.Generator().manual_seed(seed)
-    result = TensorDict(
-        observation=torch.randn(number, 39, generator=generator), task_id=torch.full((number,), lw.task_id(task))
-    ).auto_batch_size_(1)
+    result = TensorDict(observation=torch.randn(number, 39, generator=generator)).auto_batch_size_(1)
+    result["task_id"] = torch.full((number,), lw.task_id(task))
     result["qaf"] = torch.rand(number, plans.num_steps, generator=generator) < 0.5
     if step is not None:
         result["qaf"] = torch.nn.functional.one_hot(torch.as_tensor(step).expand(number), plans.num_steps).bool()

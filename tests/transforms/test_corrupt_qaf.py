@@ -71,7 +71,6 @@ def test_answers_equal_a_plain_program_over_any_resets(options, done):
 
 @pytest.mark.parametrize("options", CORRUPTIONS)
 def test_soft_answers_are_corrupted_alike(options):
-
     class Evaluate(ModuleTransform):
         def _reset(self, tensordict, tensordict_reset):
             return self._call(tensordict_reset)
@@ -160,7 +159,7 @@ def test_rows_of_a_worker_that_end_at_different_steps(place):
         env = both(SerialEnv(2, workers), **options)
     actual = env.rollout(25, break_when_any_done=False)
     for row in actual.reshape(-1, 25):
-        task = "push" if row["task_id"][0] == lw.task_id("push") else "reach"
+        task = lw.MT50[row["task_id"][0]]
         for number in range(int(row["episode"].max()) + 1):
             one = row[row["episode"] == number]
             for step in range(len(one)):
@@ -195,10 +194,8 @@ def test_evaluation_does_not_depend_on_num_envs_or_other_tasks():
     corrupted = lw.transforms.CorruptQAF(plans, flip=0.2, delay=1)
 
     def answers(**options) -> dict[tuple[str, int], Tensor]:
-        seen = []
-        lw.evaluate(
-            actor, episodes_per_task=2, seed=7, max_steps=25, also_record=["qaf"], on_episode=seen.append, **options,
-        )  # fmt: skip
+        seen, settings = [], {"episodes_per_task": 2, "seed": 7, "max_steps": 25, "also_record": ["qaf"]}
+        lw.evaluate(actor, on_episode=seen.append, **settings, **options)
         return {(one.task, one.episode): one.steps.select("qaf", "action") for one in seen}
 
     few = answers(tasks=["drawer-open", "reach"], evaluator=corrupted, num_envs=2)

@@ -26,10 +26,6 @@ def turns_of(ways, rows=None, **options):
     return torch.stack(result)
 
 
-def standing(steps, rows=1):
-    return torch.zeros(steps + 1, rows, 39)
-
-
 TURNS = {
     "no motion": (lambda ways: None, {"patience": 3}, [0, 0, 0, 1, 1, 1, 2, 2]),
     "hand: 2 cm in two steps": (lambda ways: ways[:, 0, 0].copy_(0.011 * torch.arange(8)), {"patience": 3}, [0] * 8),
@@ -44,7 +40,7 @@ TURNS = {
 @pytest.mark.parametrize("name", TURNS)
 def test_turn_ends_without_motion_or_after_its_maximum_length(name):
     move, options, expected = TURNS[name]
-    ways = standing(7)
+    ways = torch.zeros(8, 1, 39)
     move(ways)
     assert turns_of(ways, **{"longest": 99, **options}).flatten().tolist() == expected
 
@@ -60,7 +56,7 @@ def test_rows_are_independent(seed, patience, longest):
 
 def test_masked_row_does_not_wait():
     rows = torch.tensor([[True, False]] * 6)
-    assert turns_of(standing(6, 2), rows, patience=3, longest=99)[-1].tolist() == [2, 0]
+    assert turns_of(torch.zeros(7, 2, 39), rows, patience=3, longest=99)[-1].tolist() == [2, 0]
 
 
 def test_reset_rows_start_with_turn_0():

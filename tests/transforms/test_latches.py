@@ -2,6 +2,7 @@
 
 import random
 from functools import partial
+from itertools import chain
 
 import pytest
 import torch
@@ -19,14 +20,10 @@ from lw_torchrl.language.queries import Clause, Query, parse_query
 from lw_torchrl.language.query_program import QueryProgram
 
 CLAUSES = {
-    "push": [
-        Clause("robot's gripper", "near", "puck"),
-        Clause("robot's gripper", "left of", "puck"),
-        Clause("puck", "above", "target location"),
-        Clause("robot's gripper", "open"),
-    ],
-    "reach": [Clause("robot's gripper", "left of", "reach target"), Clause("robot's gripper", "above", "reach target")],
+    "push": [*(Clause("robot's gripper", *words) for words in (("near", "puck"), ("left of", "puck"), ("open",)))],
+    "reach": [Clause("robot's gripper", relation, "reach target") for relation in ("left of", "above")],
 }
+CLAUSES["push"].append(Clause("puck", "above", "target location"))
 TASKS = ["push", "reach"]
 ROWS = 10
 IDS = [lw.task_id(TASKS[row % 2]) for row in range(ROWS)]
@@ -67,10 +64,7 @@ class Interpreter:
     def __init__(self, plans: lw.Plans) -> None:
         self.conditions = {task: [step.condition.expression for step in plan.steps] for task, plan in plans.items()}
         self.steps = plans.num_steps
-        self.clauses = {
-            task: list(dict.fromkeys(leaf for each in conditions for leaf in leaves(each)))
-            for task, conditions in self.conditions.items()
-        }
+        self.clauses = {task: [*dict.fromkeys(chain(*map(leaves, own)))] for task, own in self.conditions.items()}
         self.programs = {task: QueryProgram({task: list(map(str, own))}) for task, own in self.clauses.items()}
 
     def episode(self, task: str, observation: torch.Tensor) -> torch.Tensor:
@@ -90,7 +84,7 @@ def check_rollout(rollout: TensorDictBase, plans: lw.Plans) -> int:
     """Compare ``qaf`` (N, T) at the root and under "next" with the interpreter; return the number of episodes."""
     interpreter, count = Interpreter(plans), 0
     for row in rollout.reshape(-1, rollout.shape[-1]).unbind(0):
-        task = TASKS[[lw.task_id(task) for task in TASKS].index(int(row["task_id"][0]))]
+        task = lw.MT50[row["task_id"][0]]
         ends = [*(row["next", "done"].flatten().nonzero().flatten() + 1).tolist(), len(row)]
         start = 0
         for end in dict.fromkeys(ends):
@@ -175,16 +169,15 @@ def test_a_reset_by_hand_clears_only_the_latches_of_its_rows(few_latches):
 @pytest.mark.parametrize("options", [{}, {"n_steps": 3, "gamma": 0.9}, {"after_success": 5}])
 def test_a_dataset_recomputes_the_latches_of_the_environment(tmp_path, options, few_latches):
     lw.collect_demonstrations(["push", "reach"], episodes_per_task=2, root=tmp_path / "demos", max_steps=70)
-    replay = lw.LanguageWorldExperienceReplay(
-        tmp_path / "demos", label="executed", batch_size=16, transform=lw.QAFTransform(few_latches), **options
-    )
+    options |= {"label": "executed", "batch_size": 16}
+    replay = lw.LanguageWorldExperienceReplay(tmp_path / "demos", transform=lw.QAFTransform(few_latches), **options)
     rows, interpreter = replay[:], Interpreter(few_latches)
     assert rows["qaf"].any()
     for number in rows["collector", "traj_ids"].unique():
         episode = rows[rows["collector", "traj_ids"] == number]
-        task = "push" if episode["task_id"][0] == lw.task_id("push") else "reach"
+        task = lw.MT50[episode["task_id"][0]]
         assert torch.equal(episode["qaf"], interpreter.episode(task, episode["observation"]))
-        if not options:
+        if len(options) == 2:
             seen = torch.cat((episode["observation"], episode["next", "observation"][-1:]))
             assert torch.equal(episode["next", "qaf"], interpreter.episode(task, seen)[1:])
         if "n_steps" in options:
@@ -193,7 +186,7 @@ def test_a_dataset_recomputes_the_latches_of_the_environment(tmp_path, options, 
             assert torch.equal(episode["next", "qaf"][later], episode["qaf"][3:][later[:-3]])
     info = replay.sample(return_info=True)
     assert torch.equal(info[0]["qaf"], rows["qaf"][info[1]["index"]])
-    appended = lw.LanguageWorldExperienceReplay(tmp_path / "demos", label="executed", batch_size=16, **options)
+    appended = lw.LanguageWorldExperienceReplay(tmp_path / "demos", **options)
     appended.append_transform(lw.QAFTransform(few_latches))
     assert torch.equal(appended[:]["qaf"], rows["qaf"])
 
@@ -214,9 +207,7 @@ def test_what_has_no_history_is_refused(few_latches):
 
 def test_soft_truth_has_the_sign_of_the_exact_truth_and_finite_gradients():
     for seed in range(5):
-        program = QueryProgram(
-            {task: [step.condition for step in plan.steps] for task, plan in random_plans(seed).items()}
-        )
+        program = lw.QAFTransform(random_plans(seed)).program
         observation = (0.1 * torch.randn(200, 39)).requires_grad_()
         ids = torch.tensor(IDS * 20)
         latches = torch.rand(200, program.num_latches) < 0.5
@@ -229,22 +220,19 @@ def test_soft_truth_has_the_sign_of_the_exact_truth_and_finite_gradients():
                 assert torch.equal(soft > 0, exact)
 
 
-@pytest.mark.parametrize(
-    ("text", "canonical"),
-    [
-        ("the gripper has been near the puck", "G has been near the puck"),
-        ("the puck was once near the target location", "the puck has been near the target location"),
-        ("the gripper hasn't been open", "G has not been open"),
-        ("the gripper has never been open", "G has not been open"),
-        ("once (the gripper is open)", "G has been open"),
-        ("once not (the gripper is open)", "once (G is not open)"),
-        ("not once (the gripper is open and near the puck)", "not once (G is open and G is near the puck)"),
-        (
-            "once (gripper has been open and puck is above target location)",
-            "once (G has been open and the puck is above the target location)",
-        ),
-    ],
-)
+SPELLINGS = {
+    "the gripper has been near the puck": "G has been near the puck",
+    "the puck was once near the target location": "the puck has been near the target location",
+    "the gripper hasn't been open": "G has not been open",
+    "the gripper has never been open": "G has not been open",
+    "once (the gripper is open)": "G has been open",
+    "once not (the gripper is open)": "once (G is not open)",
+    "not once (the gripper is open and near the puck)": "not once (G is open and G is near the puck)",
+    "once (gripper has been open and near puck)": "once (G has been open and G is near the puck)",
+}
+
+
+@pytest.mark.parametrize(("text", "canonical"), SPELLINGS.items())
 def test_spellings(text, canonical):
     query, canonical = parse_query(text, "push"), canonical.replace("G", "the robot's gripper")
     assert str(query) == canonical
@@ -272,10 +260,8 @@ def test_without_memory_a_latch_is_its_condition():
 
 
 def test_evaluate_runs_a_plan_that_latches():
-    pairs = [
-        ("once (the gripper is near the reach target)", "move the gripper to the reach target"),
-        ("not once (the gripper is near the reach target)", "move the gripper to the reach target"),
-    ]
+    near = "once (the gripper is near the reach target)"
+    pairs = [(condition, "move the gripper to the reach target") for condition in (near, f"not {near}")]
     plans = lw.Plans([lw.ConditionalPlan.from_pairs("reach", pairs)])
     actor, done = lw.ScriptedSkillActor(plans), ("next", "qaf")
     result = lw.evaluate(actor, tasks="reach", episodes_per_task=3, seed=5, max_steps=60, num_envs=2)

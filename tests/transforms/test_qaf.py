@@ -79,12 +79,8 @@ def test_masked_rows_keep_their_answers(env):
 
 def buffer(data: TensorDictBase, plans: lw.Plans) -> TensorDictReplayBuffer:
     """Return a buffer whose samples hold every row once, in some order."""
-    replay = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(len(data)),
-        sampler=SamplerWithoutReplacement(),
-        transform=lw.QAFTransform(plans),
-        batch_size=len(data),
-    )
+    parts = {"sampler": SamplerWithoutReplacement(), "transform": lw.QAFTransform(plans)}
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(len(data)), batch_size=len(data), **parts)
     replay.extend(data)
     return replay
 

@@ -1,16 +1,21 @@
-"""RandomYaw: positions and actions turn by the same angle, and nothing else changes."""
+"""RandomYaw: positions and actions turn by the same angle, and free motions to a place are also turned in space."""
+
+from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torch.nn.functional import normalize, one_hot
 from torchrl.envs import Compose
 
 import lw_torchrl as lw
 from lw_torchrl.language.layout import METAWORLD, places
-from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
+from lw_torchrl.language.plans import PlanStep
+from lw_torchrl.transforms.random_yaw import random_rotations, turn_observation, turn_vectors
 
+MT10 = lw.load_plans("MT10")
 PLACES = [slice(start, start + 2) for start in (0, 4, 11, 18, 22, 29, 36)]
 
 
@@ -20,10 +25,6 @@ def rows(number=64, seed=0, reach=0.6):
     return TensorDict({"observation": draw(number, 39), "action": (2 * draw(number, 4) - 1) * reach}, [number])
 
 
-def angle(vectors):
-    return torch.atan2(vectors[..., 1], vectors[..., 0])
-
-
 def wrapped(angles):
     """Return the same angles in [-pi, pi)."""
     return torch.remainder(angles + torch.pi, 2 * torch.pi) - torch.pi
@@ -31,7 +32,7 @@ def wrapped(angles):
 
 def between(first, second):
     """Return the angle from the first to the second."""
-    return wrapped(angle(second) - angle(first))
+    return wrapped(torch.atan2(second[..., 1], second[..., 0]) - torch.atan2(first[..., 1], first[..., 0]))
 
 
 @settings(deadline=None, max_examples=40)
@@ -106,24 +107,18 @@ def test_written_angles_add_up_and_turn_back(times):
     torch.testing.assert_close(turn_vectors(vectors, now["observation_yaw"]), now["action"][:, [0, 1, 3]])
 
 
-PAIRS = [
-    ("gripper is not near the puck", "move the puck to the target location"),
-    ("gripper is near the puck", "push the window handle to the left"),
-    ("gripper is open", "lower the gripper around the puck"),
-]
-PLANS = lw.Plans([lw.ConditionalPlan.from_pairs("push", PAIRS)])
+ANY_ANGLE = {(1, 0, 0): True, (0, 1, 0): False, (1, 1, 0): False, (1, 0, 1): True, (0, 0, 0): False}
 
 
-@pytest.mark.parametrize(
-    ("truth", "any_angle"),
-    [((1, 0, 0), True), ((0, 1, 0), False), ((1, 1, 0), False), ((1, 0, 1), True), ((0, 0, 0), False)],
-)
+@pytest.mark.parametrize(("truth", "any_angle"), ANY_ANGLE.items())
 def test_rows_without_a_direction_are_turned_by_any_angle(truth, any_angle):
+    skills = "move the puck to the target location", "push the window handle to the left", "lower the gripper"
+    plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", [("gripper is open", skill) for skill in skills])])
     was = rows(2_000, reach=0.5)
     was["qaf"] = torch.tensor(truth, dtype=torch.bool).expand(2_000, 3)
     was["task_id"] = torch.full((2_000,), lw.task_id("push"))
     torch.manual_seed(0)
-    now = lw.RandomYaw(0.1, plans=PLANS)(was)
+    now = lw.RandomYaw(0.1, plans=plans)(was)
     turned = between(was["action"], now["action"])
     assert turned.std() == pytest.approx(torch.pi / 3**0.5 if any_angle else 0.1, rel=0.1)
     assert (turned.abs().max() > 3) == any_angle
@@ -147,11 +142,118 @@ def test_all_actions_and_the_next_observation_turn_alike(demos):
 
 
 def test_buffer_answers_on_the_unchanged_scene_and_keeps_its_storage(demos):
-    plans = lw.load_plans("MT10")
-    plain = lw.LanguageWorldExperienceReplay(demos, transform=lw.QAFTransform(plans))
-    turned = lw.LanguageWorldExperienceReplay(demos, transform=Compose(lw.QAFTransform(plans), lw.RandomYaw(1.0)))
+    plain = lw.LanguageWorldExperienceReplay(demos, transform=lw.QAFTransform(MT10))
+    turned = lw.LanguageWorldExperienceReplay(demos, transform=Compose(lw.QAFTransform(MT10), lw.RandomYaw(1.0)))
     was, now = plain[:], turned[:]
     assert torch.equal(now["qaf"], was["qaf"])
     assert not torch.allclose(now["observation"], was["observation"])
     assert torch.equal(plain[:]["observation"], was["observation"])
     assert not torch.equal(turned[:]["observation"], now["observation"]), "each sample is turned anew"
+
+
+CANONICAL = lw.canonical_plans(MT10)
+NOW = torch.eye(3)
+
+
+def in_step(task, step, number=400, also=None):
+    qaf = torch.zeros(number, CANONICAL.num_steps, dtype=torch.bool)
+    qaf[:, [step, step if also is None else also]] = True
+    return rows(number, reach=0.5).update({"qaf": qaf, "task_id": torch.full((number,), lw.task_id(task))})
+
+
+def tilted(was, tilt=1.0, scale=0.0):
+    torch.manual_seed(0)
+    return lw.RandomYaw(scale, plans=CANONICAL, tilt=tilt)(was.clone())
+
+
+def number_of(task, words):
+    return [step.skill for step in CANONICAL[task].steps].index(words)
+
+
+def test_random_rotations_are_uniform():
+    turns = random_rotations(20_000)
+    torch.testing.assert_close(turns @ turns.mT, NOW.expand(20_000, 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(turns), torch.ones(20_000), atol=1e-5, rtol=0)
+    assert turns.mean(0).abs().max() < 0.03
+    assert ((turns**2).mean(0) - 1 / 3).abs().max() < 0.02
+
+
+FREE = [("push", "carry the puck to the target location"), ("peg-insert-side", "slide the peg to the hole")]
+BOUND = [
+    ("push", "place the gripper above the puck"),
+    ("push", "close the gripper around the puck"),
+    ("window-open", "push the window handle to the left"),
+    ("drawer-open", "pull the drawer handle toward the robot"),
+    ("button-press-topdown", "push the button down"),
+]
+
+
+@pytest.mark.parametrize(("task", "words"), FREE)
+def test_free_motions_to_a_place_are_tilted_and_keep_their_length(task, words):
+    was = in_step(task, number_of(task, words))
+    now = tilted(was)
+    turns = now["observation_tilt"]
+    assert turns.shape == (400, 3, 3)
+    assert not torch.isclose(turns, NOW).all((-1, -2)).any()
+    moved = now["action"][:, :3]
+    inside = moved.abs().amax(-1) < 0.999
+    torch.testing.assert_close(moved.norm(dim=-1)[inside], was["action"][:, :3].norm(dim=-1)[inside])
+    assert moved.abs().max() <= 1.0
+    # without a direction, the row is first turned by any angle
+    flat = turn_vectors(was["action"][:, :3], now["observation_yaw"]).unsqueeze(-1)
+    torch.testing.assert_close(normalize(moved, dim=-1), normalize((turns @ flat).squeeze(-1), dim=-1))
+    assert torch.equal(now["action"][:, 3], was["action"][:, 3])
+    torch.testing.assert_close(now["observation"][:, 2], was["observation"][:, 2])
+
+
+@pytest.mark.parametrize(("task", "words"), BOUND)
+def test_other_motions_are_not_tilted_even_beside_a_free_one(task, words):
+    was = in_step(task, number_of(task, words), also=number_of(*FREE[0]) if task == "push" else None)
+    now = tilted(was)
+    assert torch.equal(now["observation_tilt"], NOW.expand(400, 3, 3))
+    torch.testing.assert_close(now["action"][:, 2], was["action"][:, 2])
+    was["qaf"] = torch.zeros_like(was["qaf"])
+    assert torch.equal(tilted(was)["observation_tilt"], NOW.expand(400, 3, 3)), "no condition is true"
+
+
+def test_motions_with_a_direction_are_not_tilted():
+    role = lw.canonical_plan(MT10["push"]).steps[-1].role
+    ways = ("left", "right", "away", "toward", "up", None)
+    roles = [replace(role, verb="move", direction=way) for way in ways]
+    condition = lw.parse_query("the gripper is near the puck", "push")
+    plans = lw.Plans([lw.ConditionalPlan("push", tuple(PlanStep(condition, role.skill, role=role) for role in roles))])
+    was = in_step("push", 0)
+    for step, way in enumerate(ways):
+        was["qaf"] = one_hot(torch.full((400,), step), len(ways)).bool()
+        turns = lw.RandomYaw(0.1, plans=plans, tilt=1.0)(was)["observation_tilt"]
+        assert torch.equal(turns, NOW.expand(400, 3, 3)) == (way is not None)
+
+
+def test_tilt_rate():
+    was = in_step("push", 3, 4_000)
+    share = (tilted(was, 0.25)["observation_tilt"] != NOW).any((-1, -2)).float().mean()
+    assert share == pytest.approx(0.25, abs=0.03)
+    assert "observation_tilt" not in tilted(was, 0.0)
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_role_features_are_tilted_like_the_action(times):
+    """An action towards the target stays an action towards the target that the features show."""
+    was = in_step("push", 3, 50)
+    was["action"][:, :3] = (was["observation"][:, 36:39] - was["observation"][:, 4:7]) * 0.3
+    now = was
+    for _ in range(times):
+        now = lw.RandomYaw(0.5, plans=CANONICAL, tilt=1.0)(now)
+    now["skill_weights"] = one_hot(torch.full((50,), 3), CANONICAL.num_steps).float()
+    features = lw.modules.RoleFeatures(CANONICAL).eval()
+    features.demonstrated.fill_(True)
+    seen = features(now)["features"]
+    torch.testing.assert_close(normalize(seen[:, :3], dim=-1), normalize(now["action"][:, :3], dim=-1))
+
+
+def test_tilt_with_renamed_keys():
+    was = in_step("push", 3)
+    moved = was.select("qaf", "task_id", "action").set(("agent", "observation"), was["observation"])
+    keys = [("agent", "observation"), "action", "expert_action", "unclipped_action"]
+    now = lw.RandomYaw(0.0, plans=CANONICAL, tilt=1.0, in_keys=keys)(moved)
+    assert now["agent", "observation_tilt"].shape == (400, 3, 3)

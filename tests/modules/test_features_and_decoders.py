@@ -1,7 +1,9 @@
-"""ObservationFeatures and Concat: the differences by hand, and statistics that are part of the module."""
+"""ObservationFeatures, Concat and decoders: differences by hand, statistics, any network as a part."""
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from small_actors import make_rows
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -9,12 +11,10 @@ from torch import nn
 
 import lw_torchrl as lw
 from lw_torchrl.language.layout import METAWORLD
-from lw_torchrl.modules import Concat, FocusFeatures, ObservationFeatures, features
+from lw_torchrl.modules import Concat, Decode, FocusFeatures, GaussianDecoder, MLPDecoder, ObservationFeatures, features
+from lw_torchrl.modules.decoder import LEAST_STD
+from lw_torchrl.modules.parts import materialize
 from lw_torchrl.suites import load_suite
-
-
-def differences(observation):
-    return features.differences(observation, METAWORLD)
 
 
 def fit(module, observation, weights=None):
@@ -28,7 +28,7 @@ def random_observation(*shape, seed=0):
 def test_differences_by_hand():
     observation = random_observation()
     hand, one, two, goal = (observation[i : i + 3] for i in (0, 4, 11, 36))
-    output = differences(observation)
+    output = features.differences(observation, METAWORLD)
     plain = torch.cat([one - hand, two - hand, goal - hand, two - one, goal - one, goal - two])
     torch.testing.assert_close(output[:18], plain)
     torch.testing.assert_close(output[18:36], torch.tanh(plain / 0.02))
@@ -39,7 +39,7 @@ def test_differences_by_hand():
 def test_differences_to_an_absent_object_are_zero():
     observation = random_observation(2)
     observation[0, 11:14] = 0
-    output = differences(observation)[:, :18].reshape(2, 6, 3)
+    output = features.differences(observation, METAWORLD)[:, :18].reshape(2, 6, 3)
     assert output[0].abs().sum(-1).eq(0).tolist() == [False, True, False, True, False, True]
     assert not output[1].abs().sum(-1).eq(0).any()
 
@@ -134,3 +134,54 @@ def test_concat_of_modules_with_other_keys():
     for wrong in ((), (nn.Linear(3, 3),)):
         with pytest.raises(TypeError, match="parts must be one or more TensorDict modules"):
             Concat(*wrong)
+
+
+LAYERS = [({"width": 7, "depth": 2}, [(10, 7), (7, 7), (7, 4)]), ({"width": 7, "depth": 0}, [(10, 4)])]
+LAYERS += [({"width": (8, 5), "actions": 3}, [(10, 8), (8, 5), (5, 3)])]
+
+
+@pytest.mark.parametrize(("options", "expected"), LAYERS)
+def test_width_and_depth_set_the_layers(options, expected):
+    decoder = MLPDecoder(**options)
+    assert decoder(torch.rand(2, 10)).shape == (2, options.get("actions", 4))
+    assert [(each.in_features, each.out_features) for each in decoder if isinstance(each, nn.Linear)] == expected
+    assert decoder.config == {"width": 256, "depth": 3, "actions": 4, "squash": True} | options
+
+
+def test_squash_keeps_the_action_within_one():
+    seen = 100 * torch.randn(50, 10)
+    assert MLPDecoder(width=8)(seen).abs().max() <= 1
+    assert MLPDecoder(width=8, squash=False)(seen).abs().max() > 1
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.015625, 40, width=32), st.booleans())
+def test_gaussian_copy_has_the_action_as_mean_and_init_std_everywhere(init_std, squash):
+    trained, copy = MLPDecoder(width=8, depth=1), GaussianDecoder(width=8, depth=1, squash=squash, init_std=init_std)
+    seen = torch.rand(6, 10)
+    for decoder in (trained, copy):
+        materialize(decoder, seen)
+    copy.copy_from(trained)
+    loc, scale = copy(seen)
+    torch.testing.assert_close(loc if squash else torch.tanh(loc), trained(seen))
+    torch.testing.assert_close(scale, torch.full((6, 4), init_std), rtol=1e-4, atol=1e-5)
+
+
+def test_standard_deviation_stays_above_its_minimum():
+    decoder = GaussianDecoder(width=8, depth=1)
+    materialize(decoder, torch.rand(1, 10))
+    nn.init.constant_(decoder[-1].bias, -1e4)
+    assert (decoder(torch.rand(5, 10))[1] >= LEAST_STD).all()
+    with pytest.raises(ValueError, match="init_std"):
+        GaussianDecoder(init_std=LEAST_STD)
+
+
+def test_any_network_becomes_a_part():
+    rows = TensorDict(skill_latent=torch.rand(3, 4), features=torch.rand(3, 4), batch_size=[3])
+    net = nn.Linear(8, 2)
+    part = Decode(net, out_keys=["action"])
+    expected = net(torch.cat((rows["skill_latent"], rows["features"]), -1))
+    assert torch.equal(part(rows.copy())["action"], expected)
+    assert torch.equal(part(rows["skill_latent"], rows["features"]), expected), "called with tensors of one shape"
+    with pytest.raises(ValueError, match="out_keys"):
+        Decode(net, out_keys=["features"])
