@@ -167,7 +167,7 @@ def check_keys(argument: str, row: Any, allowed: Iterable[str], required: Iterab
     for key in row:
         check_choice("key", key, allowed)
     if missing := [key for key in required if key not in row]:
-        raise ValueError(f"{' and '.join(missing)} of {argument} missing, got {shown(dict(row))}")
+        raise ValueError(f"{argument} must have {' and '.join(missing)}, got {shown(dict(row))}")
 
 
 def unknown_name(argument: str, value: object, allowed: Iterable[str]) -> ValueError:

@@ -60,7 +60,7 @@ def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
     """
     target = Path(os.path.realpath(expanded(path)))
     if target.exists() and not target.is_file():
-        raise OSError(errno.EISDIR if target.is_dir() else errno.EINVAL, "cannot replace this by a file", str(target))
+        raise OSError(errno.EISDIR if target.is_dir() else errno.EINVAL, "not a regular file", str(target))
     with _staged(target, sync) as temporary:
         yield temporary
         if sync:

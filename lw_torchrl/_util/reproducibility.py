@@ -1,4 +1,4 @@
-"""Reproducibility: random generators of episodes, and changes of the settings and versions that results depend on."""
+"""Reproducible random generators for episodes, and comparisons of settings and package versions."""
 
 import warnings
 from collections.abc import Iterable, Mapping

@@ -118,8 +118,8 @@ def _in_workers(pickled: bytes, parts: list[Any], workers: int, on_steps: Callab
             for future in done:
                 yield from _items(future, running.pop(future))
     except BrokenProcessPool as error:
-        advice = "repeat the call; if memory is short, use fewer workers"
-        raise RuntimeError(f"a worker process was killed, for example because memory was short: {advice}") from error
+        advice = "repeat the call, with fewer workers if memory is low"
+        raise RuntimeError(f"a worker process was killed, possibly because memory ran out: {advice}") from error
     finally:
         end.close()  # ends the workers at once
         pool.shutdown(cancel_futures=True)

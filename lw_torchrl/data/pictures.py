@@ -138,7 +138,7 @@ def _render(
             stored = rows[starts + torch.minimum(torch.tensor(step), lengths - 1)]
             if not torch.equal(state.get("observation")[active], stored.get("observation")[active]):
                 versions = ", ".join(f"{name} {version}" for name, version in demonstrations.versions.items())
-                problem = f"{str(demonstrations.root)!r} differs from step {step} of {task!r} on when re-run"
+                problem = f"re-running {task!r} of {str(demonstrations.root)!r} gives other states from step {step} on"
                 raise DatasetError(f"root: {problem}; install the versions with which it was collected: {versions}")
             if step % pictures.every == 0:
                 for place in active.nonzero().flatten().tolist():

@@ -43,7 +43,7 @@ def to_device_of(storage: Storage, index: Tensor) -> Tensor:
 
 
 def column(storage: Storage, key: NestedKey, rows: Tensor | None = None) -> Tensor:
-    """Return the value (R,) of a column in all rows, or in the given rows, on the CPU; raise KeyError if it is missing.
+    """Return a column's values (R,) in all rows or the given rows, on the CPU; raise KeyError if it is missing.
 
     A row may store its value in any shape, for example (1,), or (T,) with equal entries if rows are trajectory slices.
     """

@@ -126,9 +126,9 @@ def kept_rows(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tenso
 
 
 def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName, after: int | None) -> Tensor:
-    """Return the episode return and the number of rows, (E, 2) float64, of each chosen episode.
+    """Return each chosen episode's return and number of rows, (E, 2) float64.
 
-    Only the rows up to ``after`` time steps after the first success count (None for all rows).
+    Rows more than ``after`` time steps after an episode's first success are ignored; None keeps all rows.
     """
     rows, (kept, lengths) = load_rows(whole).get("next"), kept_rows(chosen.episodes, after)
     kind = REWARDS[reward]

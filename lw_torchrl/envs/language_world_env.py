@@ -189,7 +189,7 @@ class LanguageWorldEnv(EnvBase):
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Restore the seed and episode counters saved by an environment with the same rows; call ``reset`` next."""
         if strict and not state_dict:
-            raise ValueError("state_dict is empty: save it with a QAFTransform, or use strict=False for episode 0")
+            raise ValueError("state_dict is empty: add a QAFTransform before saving, or use strict=False to ignore it")
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def __getstate__(self) -> NoReturn:

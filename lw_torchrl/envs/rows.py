@@ -74,7 +74,7 @@ class EpisodeCounter:
             episode.cpu().numpy() if isinstance(episode, Tensor) else np.array(check_value("episode", episode, int))
         )
         if numbers.shape not in ((), (n,)) or numbers.dtype.kind != "i" or (numbers < 0).any():
-            raise ValueError(f"episode must be an int64, or int64 of shape ({n},), of at least 0, got {shown(episode)}")
+            raise ValueError(f"episode must be a non-negative int, or int64 of shape ({n},), got {shown(episode)}")
         return np.broadcast_to(numbers, n)[rows].astype(np.int64)
 
     def seeds(self, rows: Rows, episodes: Episodes) -> list[int]:

@@ -1,4 +1,4 @@
-"""Model cards of policies; save and load policies with their cards, in folders and on the Hugging Face Hub."""
+"""Save and load policies and their model cards, in folders and on the Hugging Face Hub."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ _LATE = 50  # number of last states of a failed episode, in which the episode ma
 
 @dataclass
 class TaskUse:
-    """Statistics of one task's plan over all episodes of the task, each up to 20 time steps after the first success.
+    """Statistics of a task's plan over all episodes of the task, each cut 20 time steps after its first success.
 
     If no skill weights were recorded, ``chosen`` is empty; ``stuck`` then counts true conditions.
     """

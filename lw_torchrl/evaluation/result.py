@@ -133,7 +133,7 @@ class EvaluationResult:
             failed = sorted((e.task, e.episode, config["seed"]) for e in episodes if not e.success)
             attributed = failed if failures is None else sorted((f.task, f.episode, f.seed) for f in failures)
             if failed != attributed or any(failure.at >= last for failure in failures or ()):
-                raise ValueError(f"failures must hold a Failure of each failed episode, with its seed, at t < {last}")
+                raise ValueError(f"failures must hold one Failure per failed episode, with its seed and t < {last}")
             if set(content["success_once"]) != {*tasks}:
                 raise ValueError("success_once and config must have the same tasks")
             return result

@@ -142,10 +142,9 @@ def _with_own(
 
 
 def _own_motions(task: Task, steps: Sequence[PlanStep], held: Query) -> list[PlanStep]:
-    """Return the plan's motions of a held object, if there are several; otherwise return an empty list.
+    """Return the plan's steps that move a held object, if they include different motions; otherwise return [].
 
-    ``held`` replaces the parts of their conditions that mention the gripper. The last motion is also active wherever no
-    other motion is.
+    ``held`` replaces what their conditions state about the gripper. The last step is also active where no other is.
     """
     moving = [step for step in steps if role_of(step).verb in ("carry", "move") and not is_free(step)]
     distinct = {(role_of(step).moved, role_of(step).target, role_of(step).direction) for step in moving}

@@ -78,7 +78,7 @@ class Layout:
         acting = (*moved, *places(self.effort))
         if len({*acting}) < len(acting) or max(acting, default=0) >= self.action_size:
             parts = f"displacement {self.displacement} and gripper {self.gripper} of {layout}"
-            raise ValueError(f"{parts} must be different indices of {self.action_size} action numbers")
+            raise ValueError(f"{parts} must be distinct indices from 0 to {self.action_size - 1}")
         object.__setattr__(self, "thresholds", ReadOnlyDict(dict(self.thresholds)))
         for name in ("present", "positions", "all_positions", "parts"):
             getattr(self, name)  # computed eagerly, since torch.compile cannot trace the lock of a cached_property
@@ -150,4 +150,4 @@ def places(part: slice) -> tuple[int, ...]:
 
 
 METAWORLD = Layout("metaworld", 39, hand=0, opening=3, things=(Slot(4, 7), Slot(11, 14)), goal=36, past=18, reach=0.01)
-"""The layout of Meta-World's 39-number observations. In a task with one object, the second object's numbers are 0."""
+"""Meta-World's layout with 39-dimensional observations. In one-object tasks, the second object's entries are 0."""

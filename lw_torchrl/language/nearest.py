@@ -64,7 +64,7 @@ class QueryMatch:
 
     @property
     def least_score(self) -> float:
-        """The smallest score of a part."""
+        """The lowest score of any part."""
         return min(part.score for part in self.parts)
 
 

@@ -47,7 +47,7 @@ class Atom(NamedTuple):
 
     @property
     def threshold(self) -> float:
-        """The threshold in metres; the atom is true if its value is below (not below, if :attr:`flipped`)."""
+        """The threshold in metres; the atom is true if its value is below it (at or above it if :attr:`flipped`)."""
         return self.part.threshold if self.part.sense == "<" else -self.part.threshold
 
     @property

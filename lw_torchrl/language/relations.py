@@ -53,7 +53,7 @@ def _check_predicate(name: str, parts: Any, others: Iterable[str]) -> tuple[Comp
         raise ValueError(f"name of a predicate must be lower-case words like 'left of', got {shown(name)}")
     is_beginning = name.split()[0] in ("is", "isn't", "not")
     if name in others or is_beginning or not {*name.split()}.isdisjoint((*CONNECTIVES, "the", "a", "an")):
-        raise ValueError(f"name {name!r} must not be or contain words that are reserved in queries, such as 'and'")
+        raise ValueError(f"name {name!r} is taken, or contains a word that is reserved in queries, such as 'and'")
     if not isinstance(parts, (tuple, list)) or not parts or not all(isinstance(part, Comparison) for part in parts):
         raise ValueError(f"{name!r} must be a tuple of at least one Comparison, got {shown(parts)}")
     return tuple(parts)

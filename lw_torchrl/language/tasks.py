@@ -62,7 +62,7 @@ class Task:
                     raise ValueError(f"position of {named.name!r} must use obs[0] to obs[{size - 1}], got obs[{index}]")
         names = [named.name for named in self.objects]
         if names[:1] != [GRIPPER] or len({*names}) != len(names) or len(names) > _MOST_OBJECTS:
-            raise ValueError(f"objects of {self.name!r} must be 1 to 64 distinct names, {GRIPPER!r} first, got {names}")
+            raise ValueError(f"objects of {self.name!r} must be 1 to 64, distinct, {GRIPPER!r} first, got {names}")
 
     @cached_property
     def object_names(self) -> tuple[str, ...]:
@@ -256,7 +256,7 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[
         names = _SETS.get(names, (names,))
     checked = [check_task(name, tasks) for name in names]
     if not checked or len({*checked}) < len(checked):
-        raise ValueError(f"tasks must be at least one task, and each only once, got {shown(checked)}")
+        raise ValueError(f"tasks must name at least one task, without duplicates, got {shown(checked)}")
     return tuple(sorted(checked))
 
 
@@ -284,13 +284,13 @@ def get_task(task: str | Task, tasks: Tasks = TASKS) -> Task:
 
 
 def lists_by_task(argument: str, lists: Mapping[str | Task, Any]) -> dict[Task, list[Any]]:
-    """Return lists by :class:`Task`; raise a ValueError if there is none, one is empty, or a task is there twice."""
+    """Return lists by :class:`Task`; raise a ValueError for no lists, an empty list or a repeated task."""
     check_value(argument, lists, Mapping)
     tasks = (name if isinstance(name, Task) else TASKS[check_choice(argument, name, TASKS)] for name in lists)
     by_task = dict(zip(tasks, lists.values(), strict=True))
     is_full = bool(by_task) and all(isinstance(listed, list | tuple) and listed for listed in by_task.values())
     if not is_full or len({task.name for task in by_task}) < len(lists):
-        raise ValueError(f"{argument} must map tasks, each once, to lists of at least one item, got {shown(lists)}")
+        raise ValueError(f"{argument} must map one or more distinct tasks to non-empty lists, got {shown(lists)}")
     return by_task
 
 

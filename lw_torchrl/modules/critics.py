@@ -117,7 +117,7 @@ class QValue(Value):
 
 
 class _OnPlanTrunk:
-    """A base class of critics whose trunk is :func:`plan_trunk`."""
+    """Base class for critics whose trunk is :func:`plan_trunk`."""
 
     @typed
     def __init__(

@@ -27,7 +27,7 @@ LEAST_STD = 1e-3
 
 
 class _ActionMLP(MLP):
-    """A base class of MLP decoders. ``squash`` can change after construction, so ``config`` reads its current value."""
+    """Base class for MLP decoders. ``squash`` can change after construction, so ``config`` reads its current value."""
 
     _options: dict[str, Any]
     squash: bool
@@ -103,7 +103,7 @@ class GaussianDecoder(_ActionMLP):
 
     @torch.no_grad()
     def copy_from(self, decoder: MLPDecoder) -> None:
-        """Copy a deterministic decoder's weights to the mean, and reset the standard deviation to ``init_std``."""
+        """Use a deterministic decoder's weights for the mean, and reset the standard deviation to ``init_std``."""
         for own, theirs in zip([*self][:-1], [*decoder][:-1], strict=True):
             own.load_state_dict(theirs.state_dict())
         last, trained = self[-1], decoder[-1]

@@ -28,7 +28,7 @@ _FINE, _COARSE = 0.02, 0.1  # metres, the scales at which tanh squashes each dif
 
 
 class Features(TensorDictModuleBase):
-    """A base class of feature modules. A subclass implements :meth:`compute`; noise is added during training.
+    """Base class for feature modules. A subclass implements :meth:`compute`; noise is added during training.
 
     Reads ``in_keys``; writes ``features`` (B, F) float32. The noise is drawn from PyTorch's global generator.
 

@@ -83,8 +83,8 @@ class PointingNetwork(ClauseNetwork):
         return self.judge(first - second, clauses)
 
     def places(self, seen: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
-        """Return positions in metres and openings (B, N, 4) float32 of objects with learned vectors (N, 32) float32 in
-        pictures (B, H, W·C, 3) uint8, and the attention over each picture (B, C, N, h, w) float32."""
+        """Locate objects, given as learned vectors (N, 32) float32, in pictures (B, H, W·C, 3) uint8. Return positions
+        in metres and openings (B, N, 4) float32, and the attention over each picture (B, C, N, h, w) float32."""
         rows = len(seen)
         pictures = seen.unflatten(-2, (self.cameras, -1)).permute(0, 2, 4, 1, 3).flatten(0, 1)
         features = self.encoder(pictures.to(torch.float32) / 255.0)

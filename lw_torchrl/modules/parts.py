@@ -81,7 +81,7 @@ def in_mode_of(own: nn.Module, other: Module) -> Module:
 
 
 class Part(TensorDictModuleBase):
-    """A base class of policy parts. ``reads`` and ``writes`` are the default input and output keys."""
+    """Base class for policy parts. ``reads`` and ``writes`` are the default input and output keys."""
 
     _options: ClassVar[Sequence[str]] = ()  # constructor arguments that are also attributes
 
@@ -100,7 +100,7 @@ class Part(TensorDictModuleBase):
 
 
 class RenamedInputs(TensorDictModuleBase):
-    """A base class of modules with assignable ``in_keys``: new keys also rename the keys that the submodules read, but
+    """Base class for modules with assignable ``in_keys``: new keys also rename the keys that the submodules read, but
     not the keys of other modules that share these submodules."""
 
     @property

@@ -253,7 +253,7 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
 
     @classmethod
     def of(cls, actor: Any, distribution: DistributionName, init_std: float) -> StochasticActor:
-        """Make a stochastic copy of an actor, whose mode is the actor's action, without noise in the features.
+        """Make a stochastic copy of an actor, with the actor's action as the mode and without noise in the features.
 
         Raises:
             TypeError: the actor's decoder is not an :class:`MLPDecoder`.

@@ -32,7 +32,7 @@ Answers = Literal["soft", "hard"]
 
 
 class QueryEvaluator(TensorDictModuleBase):
-    """A base class of modules that answer plan conditions for a policy.
+    """Base class for modules that answer plan conditions for a policy.
 
     Training ``TensorDictSequential(evaluator, actor)`` trains both modules. A subclass implements :meth:`logits`, and
     adds the keyword arguments of its constructor to ``config``.
@@ -105,7 +105,7 @@ class QueryEvaluator(TensorDictModuleBase):
         raise NotImplementedError(f"{type(self).__name__} must override logits")
 
     def logits_of(self, tensordict: TensorDictBase) -> Tensor:
-        """Compute :meth:`logits` for a tensordict and convert them to float32; raise unless they are floats (B, S)."""
+        """Compute :meth:`logits` of a tensordict as float32; raise a ValueError unless they are floats (B, S)."""
         logits = self.logits(*read(tensordict, self.in_keys))
         if not logits.is_floating_point() or logits.shape[-1:] != (self.plans.num_steps,):
             name, got = type(self).__name__, f"{logits.dtype} of shape {tuple(logits.shape)}"
@@ -124,7 +124,7 @@ class QueryEvaluator(TensorDictModuleBase):
         return write(tensordict, self, [qaf, logits])
 
     def transform(self) -> Transform | None:
-        """Return a new transform that writes the module's in_keys that environments lack, or None if there are none."""
+        """Return a new transform that writes the ``in_keys`` missing from an environment; None if none are missing."""
         return None
 
     def with_plans(self, plans: AnyPlans) -> QueryEvaluator:
@@ -181,7 +181,7 @@ class Clauses(NamedTuple):
 
 
 class ClauseEvaluator(QueryEvaluator):
-    """A base class of query evaluators whose networks are trained on exact answers.
+    """Base class for query evaluators whose networks are trained on exact answers.
 
     Reads a view of a state, such as an observation or pictures, and ``task_id``; writes the keys of
     :class:`QueryEvaluator`, with logits of -1e4 beyond a plan's last step. The network answers single clauses, which

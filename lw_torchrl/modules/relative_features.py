@@ -33,7 +33,7 @@ Pair = tuple[NamedObject, NamedObject]
 
 
 class _RelativePositions(Features):
-    """A base class of features that are relative positions of objects, mixed by the attention over a plan's steps.
+    """Base class for features that are relative positions of objects, mixed by the attention over a plan's steps.
 
     ``pairs`` returns at most ``number`` = P pairs of objects for each plan step. The features contain the position of
     each pair's second object relative to the first, and zeros for missing pairs.
@@ -326,7 +326,7 @@ def _moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
 
 
 def _ahead(plan: ConditionalPlan) -> list[list[Pair]]:
-    """Return the first object and the target of each plan step with a direction toward the goal or an object."""
+    """Return the pair (first object, target) of each plan step that moves toward the goal or an object, else []."""
     task = plan.definition
     x, y, z = places(task.layout.positions[1])
     first = NamedObject("first object", (x, y, z))

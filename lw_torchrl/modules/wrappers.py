@@ -22,7 +22,7 @@ from lw_torchrl.modules.policy import layout_of, plans_of, tasks_of, with_plans
 
 
 class _Wrapper(RenamedInputs):
-    """A base class of wrappers. ``_options`` are the constructor arguments, which are also attributes."""
+    """Base class for wrappers. ``_options`` are the constructor arguments, which are also attributes."""
 
     _options: ClassVar[Sequence[str]]
 
@@ -39,7 +39,7 @@ class _Wrapper(RenamedInputs):
 
 
 class _ActionWrapper(_Wrapper):
-    """A base class of wrappers that change the action of a single actor."""
+    """Base class for wrappers that change the action of a single actor."""
 
     def __init__(self, actor: TensorDictModuleBase) -> None:
         super().__init__()

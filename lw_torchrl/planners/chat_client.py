@@ -322,7 +322,7 @@ def _read_completion(content: bytes) -> tuple[Reply, str]:
         notes = [f"the server sent {_excerpt(name)[:40]} instead of an answer" for name in others if name != "content"]
         if "content" in others:
             text = _excerpt(str(message["content"]))
-            notes.append(f"the server sent content without a text instead of an answer: {text}")
+            notes.append(f"the server sent no answer: its content has no text ({text})")
     usage = body.get("usage")
     counts = [usage.get(name) if isinstance(usage, dict) else 0 for name in ("prompt_tokens", "completion_tokens")]
     tokens = Tokens(*(count if type(count) is int and count >= 0 else 0 for count in counts))

@@ -199,8 +199,8 @@ class Opening(NamedTuple):
 
     @classmethod
     def of(cls, tabs: Tabs | None, episode: str | None, step: int | None) -> Opening:
-        """Return the opening of the tab ``episode``. If another program wrote the recording (``tabs`` is None), only
-        the time step is set."""
+        """Return the view in which the tab ``episode`` opens. If another program wrote the recording (``tabs`` is
+        None), only the time step is set."""
         if tabs is None:
             return cls(None, None, step)
         number = None if episode is None else tabs.index(episode)

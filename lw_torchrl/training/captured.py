@@ -32,7 +32,7 @@ def foreign_code(objects: Iterable[Any]) -> str:
 
 
 def captures(device: torch.device) -> bool:
-    """Return whether PyTorch can capture work on a device as a graph."""
+    """Return whether PyTorch can capture graphs, such as CUDA graphs, on a device."""
     return device.type != "cpu" and hasattr(torch.get_device_module(device), "CUDAGraph")
 
 

@@ -204,7 +204,7 @@ def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
             raise ValueError("in_keys or out_keys were changed after construction; pass them to the constructor")
         _copy_tensors(module.state_dict(), again.state_dict(keep_vars=True))
     except Exception as error:
-        reason = f"its description does not rebuild it ({_one_line(error)})"
+        reason = f"it cannot be rebuilt from its description ({_one_line(error)})"
         raise ValueError(f"{kind} cannot be saved, because {reason}") from error
 
 

@@ -78,7 +78,7 @@ class EvaluatorAnchor:
     def __init__(self, actor: nn.Module) -> None:
         evaluators = evaluators_of(actor)
         if len(evaluators) != 1:
-            got = f"got {type(actor).__name__} with {len(evaluators)}"
+            got = f"got {type(actor).__name__} with {len(evaluators)} evaluators"
             raise ValueError(f"qaf_anchor requires one evaluator, as in TensorDictSequential(evaluator, actor), {got}")
         self.evaluator, plans = evaluators[0], evaluators[0].plans
         self.program, tables = plan_program(plans), PlanTables(plans)

@@ -136,7 +136,7 @@ class LabelledQueries:
             hand, episode = (rows.get(key) for key in ("observation", ("collector", "traj_ids")))
             moved = hand[:, present[0].layout.positions[0]].diff(dim=0).norm(dim=-1) > _MOVED
             if any(torch.equal(pixels[row], pixels[row + 1]) for row in (moved & (episode.diff() == 0)).nonzero()):
-                raise ValueError("every must be the time steps between pictures: two are equal although the hand moved")
+                raise ValueError("every must equal that of add_pictures: some pictures repeat although the hand moved")
         generator = torch.Generator().manual_seed(config.seed)
         self.held_out_tasks = _draw_tasks(config.held_out_tasks, [task.name for task in present], generator)
         trained = [task for task in present if task.name not in self.held_out_tasks]

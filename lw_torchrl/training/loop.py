@@ -32,7 +32,7 @@ READ_EVERY = 100
 def make_optimizer(
     rates: Iterable[tuple[Iterable[Tensor], float]], config: Any, device: torch.device
 ) -> torch.optim.Optimizer:
-    """Create the optimizer that the config selects, for parameter groups, each with its own learning rate.
+    """Create the optimizer that the config selects, with a separate learning rate for each parameter group.
 
     On a CUDA device the learning rates are tensors, so that a CUDA graph can capture the optimizer step.
     """

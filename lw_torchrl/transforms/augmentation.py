@@ -26,7 +26,7 @@ ACTIVE_WEIGHT = 0.01
 
 
 class PlanAugmentation(Transform):
-    """A base class of augmentations that depend on a row's active plan steps, whose attention is above 0.01. Using one
+    """Base class for augmentations that depend on a row's active plan steps, whose attention is above 0.01. Using one
     in an environment raises a :class:`TypeError`."""
 
     steps: Tensor
@@ -206,7 +206,7 @@ def mentioned(plans: Plans, tables: PlanTables) -> Tensor:
 
 
 def role_table(plans: Plans, tables: PlanTables, holds: Callable[[StepRole], bool]) -> Tensor:
-    """Return whether ``holds`` is true for each plan step's role, (T, S) bool; raise if a plan step has no role."""
+    """Return a mask (T, S) bool of steps whose role satisfies ``holds``; raise ValueError if a step has no role."""
     table = torch.zeros_like(tables.mask)
     for task, plan in plans.items():
         for number, step in enumerate(plan.steps):

@@ -66,7 +66,7 @@ def _flat(transform: Transform) -> list[Transform]:
 
 
 class EpisodeTransform(Transform):
-    """A base class of transforms that keep state per episode. After cloning or loading one, reset the environment."""
+    """Base class for transforms that keep state per episode. After cloning or loading state, reset the environment."""
 
     def _forget_episodes(self) -> None:
         """Delete the state of all episodes, so that a reset is required."""
@@ -82,7 +82,7 @@ class EpisodeTransform(Transform):
 
 
 class KeepsEnvState(EpisodeTransform):
-    """A base class of transforms that save the environment's state in their own ``state_dict``.
+    """Base class for transforms that save the environment's state in their own ``state_dict``.
 
     TorchRL does not save this state, so a resumed Collector would run the same episodes again. After
     ``load_state_dict``, reset the environment (``collector.reset()``).

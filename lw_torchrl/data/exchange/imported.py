@@ -36,7 +36,7 @@ class ExchangeError(DatasetError):
 
 @dataclass(frozen=True)
 class ImportedTable(EpisodeRows):
-    """The rows of consecutive episodes in another format's files; :class:`.reader.Files` explains the attributes."""
+    """Rows of consecutive episodes, imported from another format; see :class:`.reader.Files` for the attributes."""
 
     columns: Mapping[str, Array]
     lengths: tuple[int, ...]
@@ -222,7 +222,7 @@ def task_names(table: ImportedTable, suite: Suite, task: str | Mapping[str | int
         found = [mapped[text] for text in texts if text in mapped]
         found += [known[text] for each in texts for text in (each, _plain(each), _hyphens(each)) if text in known]
         if not found:
-            hint = f"; or map it with task={{{shown(texts[0])}: 'reach'}}, for example" if texts else ""
+            hint = f" (to map it, pass for example task={{{shown(texts[0])}: 'reach'}})" if texts else ""
             raise ValueError(f"{unknown_name('task', texts[0] if texts else None, suite.tasks)}{hint}")
         names[texts] = found[0]
     return [names[texts] for texts in table.tasks]

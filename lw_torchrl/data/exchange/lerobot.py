@@ -1,11 +1,11 @@
-"""Write LeRobot datasets in version 3.
+"""Write datasets in the LeRobot format, version 3.
 
 meta/info.json                                    the columns with types and shapes; time steps per second
 meta/stats.json                                   min, max, mean, std and count of each column
 meta/tasks.parquet                                description, task_index, name and plan of each task
 meta/episodes/chunk-000/file-000.parquet          location and statistics of each episode
 data/chunk-000/file-000.parquet                   the time steps
-videos/CAMERA/chunk-000/file-000.mp4              the pictures of ``add_pictures``
+videos/CAMERA/chunk-000/file-000.mp4              the pictures stored by ``add_pictures``
 meta/lw_torchrl.json                              the metadata of the lw_torchrl dataset, which LeRobot ignores
 """
 

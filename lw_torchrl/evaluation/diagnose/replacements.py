@@ -162,9 +162,9 @@ class Control(nn.Module):
 
     @contextmanager
     def _watching(self, true: Tensor, truth: Tensor) -> Iterator[tuple[list[tuple[Tensor, Tensor]], list[Tensor]]]:
-        """Collect the observation and the action of each innermost policy's call, and the answers of query evaluators.
+        """Record each innermost policy's observations and actions, and the answers of query evaluators.
 
-        Meanwhile, show the observation ``true`` and the answers ``truth`` instead of other ones where requested.
+        With ``correct``, policies receive the observation ``true``; with ``answer``, evaluators return ``truth``.
         """
         calls: list[tuple[Tensor, Tensor]] = []
         answers: list[Tensor] = []

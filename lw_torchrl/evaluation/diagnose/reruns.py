@@ -64,7 +64,7 @@ def _unfixed(cases: Iterable[FailedEpisode], *names: str) -> list[FailedEpisode]
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of re-runs, which replacements change."""
+    """The settings of a re-run; a replacement changes some of them."""
 
     actor: Any
     evaluator: Any
@@ -117,7 +117,7 @@ class Reruns:
         return cases
 
     def _try_measured(self, cases: list[FailedEpisode]) -> list[FailedEpisode]:
-        """Correct wrong engines, observations, answers and actions, and return the episodes that still fail."""
+        """Re-run episodes with trusted engines, observations, answers or actions; return those that still fail."""
         evaluator = self.settings.evaluator
         if callable(self.settings.engine):
             self._try("environment", [c for c in cases if c.task in self.env_options["suite"].tasks], engine=None)
@@ -159,7 +159,7 @@ class Reruns:
     def _try(
         self, name: str, cases: Sequence[FailedEpisode], settings: Settings | None = None, **changes: Any
     ) -> dict[EpisodeId, FinishedEpisode]:
-        """Re-run episodes with a replacement and keep the successful re-runs; return all of them."""
+        """Re-run episodes with a replacement, store the successful re-runs in the cases, and return all re-runs."""
         if not cases:
             return {}
         settings = replace(settings or self.settings, **changes)

@@ -1,4 +1,4 @@
-"""A failed episode and its re-runs; find wrong answers, departures from a reference plan, and the final plan step."""
+"""A failed episode with its re-runs, and functions that find the plan step and the state where it went wrong."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ class Reading:
         self.notes.append(Note(line, text))
 
     def open(self, task: str, line: int) -> None:
-        """Begin a section for a task, unless a ``def`` follows right below a heading for the same task."""
+        """Begin a section for a task, unless the current section is for the same task and has no clauses yet."""
         if self.section.task != task or self.section.clauses:
             self.sections.append(Section(task, line))
 

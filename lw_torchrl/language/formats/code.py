@@ -107,8 +107,8 @@ class Module:
                 self.section(task, function.lineno, function.body, set())
 
     def note_unread(self, module: ast.Module) -> None:
-        """Append a note for each call of a robot's method, and each text that begins with a verb, that neither a
-        program nor another note contains."""
+        """Append a note for each action that neither a program nor another note contains. An action is a call of a
+        robot's method, or a string that begins with a verb."""
         actions = [action for section in self.reading.sections for action in actions_of(section.tree)]
         lines = {action.line for action in actions} | {note.line for note in self.reading.notes}
         known = "\n".join([each.text.lower() for each in actions] + [note.text.lower() for note in self.reading.notes])

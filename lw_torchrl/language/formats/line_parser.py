@@ -270,7 +270,7 @@ class LineParser:
         self.refers.last = last
 
     def enter(self, each: Open, body: list[Part]) -> None:
-        """Continue in a branch of a choice."""
+        """Parse the next clauses into ``body``, a branch of the choice ``each``."""
         self.scopes[:] = [*each.scopes, body]
         self.acts, self.pending = [], None
 

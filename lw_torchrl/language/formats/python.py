@@ -54,7 +54,7 @@ def _write(plan: ConditionalPlan, style: Style) -> str:
 
 
 def _call(step: PlanStep, goal: Query | None) -> str:
-    """Write the method call for a step: its skill, or ``move_gripper`` with the goal."""
+    """Return the method call for a step: its skill as a method, or ``move_gripper`` with the goal."""
     if goal is None:
         verb, _, details = step.skill.partition(" ")
         return f"{verb}({quote(details)})"

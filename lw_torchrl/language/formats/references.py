@@ -80,7 +80,7 @@ class References:
         return re.sub(r"^(?:and|or|but) |(?: and| or| but)+$", "", text.replace("( ", "(").replace(" )", ")"))
 
     def _part(self, part: str, following: str, joint: str) -> str:
-        """Complete a part of a condition with its subject and its object."""
+        """Add the omitted subject and object to a part of a condition."""
         part = PATTERNS["inverted"].sub(r"\2 \1 ", part)
         relation, copula = RELATION.search(part), PATTERNS["stays"].search(part)
         start = min((match.start() for match in (relation, copula) if match), default=0)

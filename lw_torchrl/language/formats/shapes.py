@@ -1,4 +1,4 @@
-"""Values of JSON, YAML and XML in the few shapes that the reader of trees knows.
+"""Convert values of JSON, YAML and XML to the few shapes that :mod:`.trees` can read.
 
 Tables with a header, flowcharts, rows with priorities, rules in strings and JSON in strings become lists and objects.
 The fields of an object are tests, goals, facts, programs, definitions or answers.
@@ -160,7 +160,7 @@ def is_always(text: str) -> bool:
 
 
 def is_reserved(name: str, value: Any) -> bool:
-    """Return whether a name has another meaning than its definition."""
+    """Return whether a name already has a meaning, as a keyword, object or predicate, and cannot be defined."""
     is_word = plain(name) in ROLES or is_always(name)
     is_object = is_noun(name) and not any(is_told(text) for _, text in texts_in(value))
     is_relation = plain(name) in PREDICATES and not (isinstance(value, str) and is_told(value))

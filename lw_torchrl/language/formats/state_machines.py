@@ -21,7 +21,7 @@ def transitions_of(value: Any) -> dict[Any, Any]:
 
 
 def is_machine(members: list[Any], names: Collection[str]) -> bool:
-    """Return whether a transition in a table's members leads to one of the members' names."""
+    """Return whether a transition in a table leads to a member of the same table."""
     return any(mentions(value, names) for each in members for value in transitions_of(each).values()) or any(
         text in names and (role_of(key) == "transitions" or is_statement(key)) for key, text in texts_in(members)
     )

@@ -150,7 +150,7 @@ class TreeReading(Reading):
 
 
 class Tree:
-    """The conversion of a JSON value to a program. Conditions are programs of checks."""
+    """A converter of a JSON value to a program. A condition becomes a program that contains only checks."""
 
     def __init__(self, reading: Reading, text: str, start: int, value: Any, unused: Collection[str] = ()) -> None:
         self.reading, self.text, self.start, self.at, self.count = reading, text, start, 0, 0
@@ -260,7 +260,7 @@ class Tree:
         return in_turn(words, self.line(text)) if words and (hint == "act" or is_told(text)) else None
 
     def said(self, text: str) -> Expression:
-        """Convert a text to a condition; a name that the text defines stands for its definition."""
+        """Convert a condition to an expression, and replace each defined name by its definition."""
         text = _LEAD.sub("", text)
         self.conditions.add(text)
         if self.is_defined(text):

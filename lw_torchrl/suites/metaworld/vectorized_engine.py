@@ -54,7 +54,7 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
     ) -> None:
         compared = environments.COMPARED_VERSIONS
         if changes := version_changes(compared, compared):
-            raise ImportError(f"engine: verified against other versions ({', '.join(changes)}); use engine='metaworld'")
+            raise ImportError(f"engine: unverified package versions ({', '.join(changes)}); use engine='metaworld'")
         dense, tasks = reward == "dense", [check_task(task) for task in tasks]
         super().__init__([environments.model_path(task) for task in tasks], METAWORLD, num_threads)
         rewards = [reward_table()[task] if dense else None for task in tasks]
