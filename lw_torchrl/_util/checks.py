@@ -59,7 +59,7 @@ def typed(function: Function) -> Function:
 
     def read_hints() -> dict[str, Any]:
         hints: dict[str, Any] = {}
-        for name in function.__annotations__.keys() - {"return"}:  # its type may belong to a package that is missing
+        for name in function.__annotations__.keys() - {"return"}:  # the return type may be from a missing package
             argument = SimpleNamespace(__annotations__={name: function.__annotations__[name]})
             with suppress(NameError):
                 hints |= get_type_hints(argument, function.__globals__, include_extras=True)

@@ -18,7 +18,7 @@ _ASSERTING = {"cuda"}  # devices on which torch._assert_async checks without syn
 
 
 def plain(*tensors: Tensor) -> bool:
-    """Return whether the tensors hold values that Python can read. They do not during compilation or export, or inside
+    """Return whether Python can read the tensors' values, which is impossible during compilation or export, and inside
     a ``torch.func`` transform."""
     if torch.compiler.is_compiling():
         return False
@@ -53,7 +53,7 @@ def asserted(*tensors: Tensor) -> bool:
 
 
 def check_values(holds: Callable[[Tensor], Tensor], tensor: Tensor, problem: str) -> None:
-    """Raise a :class:`ValueError` unless ``holds(tensor)``; compiled code and GPUs raise a RuntimeError, later."""
+    """Raise a :class:`ValueError` unless ``holds(tensor)``; in compiled code and on GPUs, a later RuntimeError."""
     if asserted(tensor):
         torch._assert_async(holds(tensor), problem)
     elif readable(tensor) and not holds(tensor):

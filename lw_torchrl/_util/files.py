@@ -83,7 +83,7 @@ def _staged(target: Path, sync: bool = True) -> Iterator[Path]:
     """Yield a path with the target's name in a private temporary folder, and rename it to ``target`` at the end."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if sync:  # callers use sync=False to write many small files, and listing their folder each time would be slow
-        for left in target.parent.glob(f".{glob.escape(target.name)}.*.tmp"):  # of killed processes
+        for left in target.parent.glob(f".{glob.escape(target.name)}.*.tmp"):  # leftovers of killed processes
             with suppress(OSError):
                 if time.time() - left.stat().st_mtime > _ABANDONED:
                     shutil.rmtree(left)
@@ -195,7 +195,7 @@ def parse_json(content: bytes) -> dict[str, Any]:
     keys."""
     brackets = re.sub(rb'"(?:[^"\\]|\\.)*+"|[^][{}"]++', b"", content)
     steps = (1 if bracket in b"[{" else -1 for bracket in brackets)
-    if max(accumulate(steps), default=0) > _DEEPEST:  # Python cannot write or copy, or even parse, such objects
+    if max(accumulate(steps), default=0) > _DEEPEST:  # Python fails to write, copy or even parse deeper ones
         raise ValueError("the JSON is nested too deeply")
     value = json.loads(content.decode(), object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite)
     if not isinstance(value, dict):
@@ -217,7 +217,7 @@ def _finite(text: str) -> float:
 
 
 def check_damage(error: Exception) -> None:
-    """Re-raise ``error`` if a system limit, such as too many open files, caused it, and not a damaged file."""
+    """Re-raise ``error`` if its cause is a system limit, such as too many open files, and not a damaged file."""
     expected = (None, errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EINVAL)
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno not in expected):
         raise error
@@ -248,8 +248,8 @@ class LimitError(ValueError):
 
 
 def run_limited(command: Sequence[str | os.PathLike[str]], stored: int) -> subprocess.CompletedProcess[bytes]:
-    """Run a command that reads files of ``stored`` bytes; its time and memory limits grow with ``stored``. Libraries
-    that trust the sizes in a file may allocate gigabytes for a file of a few kilobytes, or never return.
+    """Run a command that reads ``stored`` bytes of files, with limits on time and memory that grow with ``stored``.
+    Libraries that trust the sizes in a file may allocate gigabytes for a file of a few kilobytes, or never return.
 
     Raise a :class:`LimitError` if the command took too long or was killed, for example because it ran out of memory.
     """

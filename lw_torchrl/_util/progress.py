@@ -16,7 +16,7 @@ def _duration(seconds: float) -> str:
 
 
 class Progress:
-    """A progress report on stderr. ``initial`` is the number of the ``total`` units that are already finished."""
+    """A progress report on stderr. At the start, ``initial`` of the ``total`` units are already finished."""
 
     def __init__(self, what: str, total: int, unit: str, *, initial: int = 0, show: bool = True) -> None:
         self.what, self.total, self.unit, self.initial = what, total, unit, initial

@@ -22,7 +22,7 @@ def check_picture(camera: str, height: int, width: int, most: int = _LARGEST) ->
 
 
 def check_cameras(cameras: str | Sequence[str], height: int, width: int, most: int = _LARGEST) -> tuple[str, ...]:
-    """Return the camera names as a tuple; raise an error if it is empty or has an unknown or repeated name."""
+    """Return the camera names as a tuple; raise an error if there are none, or if a name is unknown or repeated."""
     names = (cameras,) if isinstance(cameras, str) else tuple(cameras)
     if not names or len({*names}) < len(names):
         raise ValueError(f"cameras must be one or more distinct names, got {cameras!r}")
@@ -33,7 +33,7 @@ def check_cameras(cameras: str | Sequence[str], height: int, width: int, most: i
 
 @contextmanager
 def naming_absent_renderer() -> Iterator[None]:
-    """Convert MuJoCo's AttributeError to an ImportError that names the missing library for MUJOCO_GL."""
+    """Convert MuJoCo's AttributeError to an ImportError that names the library that MUJOCO_GL requires."""
     try:
         yield
     except AttributeError as error:

@@ -13,12 +13,12 @@ from lw_torchrl._util.checks import Natural, check_value, shown
 from lw_torchrl.language.tasks import Task, get_task
 
 SIMULATORS: tuple[str, ...] = ("metaworld", "mujoco")  # packages that determine the physics
-LIBRARIES: tuple[str, ...] = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")  # may change the last bits
+LIBRARIES: tuple[str, ...] = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")  # can change the last bits
 
 
 def episode_hash(purpose: str, task: str | Task, seed: int, episode: int) -> int:
     """Return a hash in [0, 2**63) of a purpose, task, seed and episode, the same on every machine."""
-    # For a name such as "desk/push", the suite need not be installed.
+    # A name with a prefix, such as "desk/push", is used as given, so its suite need not be installed.
     name = task if isinstance(task, str) and "/" in task else get_task(task).name
     text = f"lw_torchrl/{purpose}/{name}/{check_value('seed', seed, int)}/{check_value('episode', episode, Natural)}"
     return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little") >> 1

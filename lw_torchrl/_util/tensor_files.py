@@ -48,7 +48,7 @@ def read_tensors(path: AnyPath) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if Path(path).is_dir():
         inside = ", ".join(file.name for file in sorted(Path(path).glob(f"*{SUFFIX}"))[:3])
         raise ValueError("the path is a folder" + (f"; use a file in the folder: {inside}" if inside else ""))
-    with ExitStack() as stack:  # safe_open opens the file several times, and its own errors do not name limits
+    with ExitStack() as stack:  # safe_open opens the file several times, but its errors hide the limit on open files
         for _ in range(3):
             stack.enter_context(Path(path).open("rb"))
     try:

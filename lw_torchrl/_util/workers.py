@@ -44,7 +44,7 @@ def choose_workers(workers: int | None, time_steps: int) -> int:
     if workers is not None:
         return workers
     cores = available_cores()
-    pays = time_steps * (_THREADED - 1 / cores) >= START  # from 220,000 steps on two cores, or 55,000 on 16
+    pays = time_steps * (_THREADED - 1 / cores) >= START  # true from 220,000 steps on 2 cores, or 55,000 on 16
     return cores if pays and multiprocessing.parent_process() is None else 1
 
 
@@ -81,11 +81,11 @@ def spread(
 ) -> Generator[T]:
     """Yield the items of ``run(episodes, on_steps)``, computed for parts of the episodes in worker processes.
 
-    ``run`` calls ``on_steps`` with the number of new time steps. Workers run a pickled copy for each part of at most
-    ``largest`` episodes, and return the part's items together. An error in a worker is raised in this process, with a
-    note that lists the part's episodes; a warning is issued in this process. ``workers`` is the number of processes; 1
-    runs everything in this process. None means one per core, or this process only if workers would not save time for
-    episodes of ``max_steps`` time steps, if ``run`` cannot be pickled, or if ``alone``.
+    ``run`` calls ``on_steps`` with the number of new time steps. Each part has at most ``largest`` episodes; a
+    worker runs a pickled copy of ``run`` on the part and returns the part's items together. Errors and warnings of
+    workers are raised in this process; an error has a note that lists the part's episodes. ``workers`` is the number of
+    processes; 1 runs everything in this process. None means one per core, or only this process if workers would not
+    save time for episodes of ``max_steps`` time steps, if ``run`` cannot be pickled, or if ``alone`` is true.
 
     Raise a :class:`ValueError` if ``run`` cannot be pickled, and a :class:`RuntimeError` if a worker was killed.
     """

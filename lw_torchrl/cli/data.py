@@ -89,7 +89,7 @@ def _show_dataset(output: Output, dataset: Demonstrations) -> Output:
 
 @dataclass(kw_only=True)
 class Show:
-    """Summarize datasets: collection policy, success rate, return. Print a joint summary of several datasets, too.
+    """Summarize datasets: collection policy, success rate, return. For several datasets, also print a joint summary.
 
     Example: lw-torchrl data show demos/mt10 demos/noisy --check
     """

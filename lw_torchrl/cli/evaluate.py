@@ -126,7 +126,7 @@ class Rollout:
 
 
 def _check_scripted(plans: Plans, skills: Mapping[str, ScriptedSkill], sources: tuple[str, ...]) -> None:
-    """Raise a ValueError that names the steps of a plan that have no scripted skill, each with the task's nearest."""
+    """Raise a ValueError if plan steps have no scripted skill; name these steps and the nearest scripted skills."""
     for task, plan in plans.items():
         own = skills_for(plan.definition, skills)
         texts = {number: step.skill for number, step in enumerate(plan.steps, 1) if step.skill not in skills}

@@ -52,7 +52,7 @@ _USER_ERRORS = (ValueError, OSError, ImportError, RuntimeError)
 
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command line; raise :class:`SystemExit` unless the exit status is 0."""
-    if args is None:  # this process only runs the command
+    if args is None:  # called by the console script
         warnings.formatwarning = _warning_text
     words = [_HOME.sub(_expand, word) for word in (sys.argv[1:] if args is None else args)]
     try:

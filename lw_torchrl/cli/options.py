@@ -1,4 +1,4 @@
-"""Options shared by several commands, and functions that load the tasks, plans, skills and policies they name."""
+"""Options shared by several commands, and functions that load the tasks, plans, skills and policies that these name."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> 
     if Path(name).exists() or not (":" in name or name == "StateQueryEvaluator"):
         return lw.training.load_evaluator(name, plans, text_encoder=encoder)
     evaluator: Any = import_object("--evaluator", name) if ":" in name else lw.modules.StateQueryEvaluator
-    evaluator = check_value("--evaluator", evaluator, lw.QueryEvaluator | type[lw.QueryEvaluator])
+    evaluator = check_value(f"--evaluator {name}", evaluator, lw.QueryEvaluator | type[lw.QueryEvaluator])
     return evaluator(plans) if isinstance(evaluator, type) else evaluator.with_plans(plans)
 
 
@@ -211,8 +211,8 @@ def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite |
 
     if name is None:
         return find_suite(tasks) if any("/" in task or suite_name(task) != "metaworld" for task in tasks) else None
-    suite: Suite = check_value("--suite", import_object("the suite", name) if ":" in name else load_suite(name), Suite)
-    return suite
+    suite = import_object("the suite", name) if ":" in name else load_suite(name)
+    return check_value(f"--suite {name}", suite, Suite)
 
 
 def read_tasks(task_file: Path | None, names: Sequence[str] = (), suite: str | None = None) -> Mapping[str, Task]:
@@ -232,14 +232,14 @@ def tasks_of_plans(path: Path, task: str | None, task_file: Path | None) -> Mapp
 
 
 def is_answer(file: Path) -> bool:
-    """Return whether a file must be decoded, being neither a .plan file nor JSON of (condition, skill) pairs."""
+    """Return whether a file holds a model's answer: neither a .plan file nor JSON with (condition, skill) pairs."""
     return file.suffix not in (".plan", ".json") or (
         file.suffix == ".json" and not is_pairs(read_text(file, PlanError, limit=PLAN_LIMIT))
     )
 
 
 def task_of_answer(file: Path, text: str, known: Mapping[str, Task]) -> str:
-    """Return the task named in the file's name or, if that names none, in a function or a heading of the text."""
+    """Return the task named in the file's name; otherwise the task named in a function or a heading of the text."""
     names = re.findall(r"^\s*def (\w+)|\btask [\"'`]([\w/-]+)[\"'`]", text, re.MULTILINE)
     for name in (re.sub(r"-\d+$", "", file.stem), *(name for pair in names for name in pair)):
         if (task := name.replace("__", "/").replace("_", "-")) in known:
@@ -300,7 +300,7 @@ def find_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> dict[str, C
 
 
 def use_one_thread() -> None:
-    """Use one PyTorch thread unless OMP_NUM_THREADS is set: networks this small gain little from a second thread."""
+    """Use one PyTorch thread unless OMP_NUM_THREADS is set: small networks gain little from a second thread."""
     if "OMP_NUM_THREADS" not in os.environ:
         import torch
 

@@ -76,7 +76,7 @@ def run_episodes(
     Args:
         env: a LanguageWorldEnv, with or without transforms.
         policy: a function of a TensorDict of all N rows, whose ``_step`` mask (N,) bool marks the active rows.
-        episodes: a mapping from task name to episode indices; repeated indices are run repeatedly.
+        episodes: a mapping from task name to episode indices; an index listed twice is run twice.
         keys: the keys to record at each time step, such as ``("next", "success")``. The recorded ``action`` is the
             executed action.
         noise: a function that maps an episode index to the standard deviations (A,) of the noise on the action; None
@@ -86,7 +86,7 @@ def run_episodes(
         clean_action: the key to which to write the action before noise is added.
         place: the key to which to write the position (N,) int64 of each row's episode in its task's list, for the
             policy.
-        on_progress: called after each step with the number of new steps; the steps that an early end skips also count.
+        on_progress: called after each step with the number of new time steps, including those skipped by an early end.
     """
     base = check_value("env", env.base_env if isinstance(env, TransformedEnv) else env, LanguageWorldEnv)
     rows = len(base.row_tasks)

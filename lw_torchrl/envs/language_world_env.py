@@ -137,7 +137,7 @@ class LanguageWorldEnv(EnvBase):
         self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
         self.worker = (0, 1) if worker is None else worker
         if not 0 <= self.worker[0] < self.worker[1]:
-            raise ValueError(f"worker must be (w, W) with 0 <= w < W, got {worker}")
+            raise ValueError(f"worker must be (index, number of workers) with 0 <= index < number, got {worker}")
         self._process = os.getpid()
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], seed, self.worker)
         super().__init__(device=check_device("device", device), batch_size=(num_envs,) if batch_size is None else ())

@@ -143,7 +143,7 @@ def _training(description: Mapping[str, Any], demonstrated: set[str]) -> str:
 
 
 def _value(value: object) -> str:
-    """Return a value as Markdown; a list of numbers keeps its brackets."""
+    """Return a value as Markdown text, escaped unless it is a number or a list of numbers."""
     text = str(value)
     return text if re.fullmatch(r"[-+\d.,e \[\]]*", text) else markdown(text)
 

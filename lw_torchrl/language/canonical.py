@@ -203,7 +203,7 @@ def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> t
 
 
 def _approach(each: ParsedStep, purpose: ParsedStep | None) -> tuple[Verb, Manner, Direction | None]:
-    """Return (verb, manner, direction) of a step that prepares the step ``purpose``; None means a grasp."""
+    """Return (verb, manner, direction) of a step that prepares for the step ``purpose``, or for a grasp if None."""
     verb = "descend" if each.verb == "beside" else each.verb
     if purpose is None:
         return verb, "grasp", None

@@ -44,7 +44,7 @@ def _has_sides(roles: Sequence[StepRole]) -> bool:
 
 
 def coverage_of(task: Task, steps: Sequence[PlanStep]) -> float:
-    """Return the fraction of typical states in which at least one step is active, and all are right for the motion."""
+    """Return the fraction of typical states in which some step is active and every active step suits the motion."""
     roles = [role_of(step) for step in steps]
     motion = motion_of(roles)
     if motion is None:

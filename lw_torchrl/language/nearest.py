@@ -46,7 +46,7 @@ _TARGET = re.compile(
 
 
 class QueryPart(NamedTuple):
-    """A clause of a text, the nearest query, and the similarity of the two in [0, 1]."""
+    """A clause of a text, the query nearest to it, and their similarity in [0, 1]."""
 
     text: str
     query: Query

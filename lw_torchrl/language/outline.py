@@ -63,7 +63,7 @@ def outline(guards: Sequence[Any]) -> list[Line]:
 
 
 def _parts(expression: Expression) -> tuple[Expression, ...]:
-    """Return the parts of a conjunction; any other expression is its own only part."""
+    """Return the parts of a conjunction; for any other expression, only the expression itself."""
     return expression.parts if expression.kind == "all" else (expression,)
 
 

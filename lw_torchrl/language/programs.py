@@ -74,7 +74,7 @@ class Selector:
 
 @dataclass(frozen=True)
 class Loop:
-    """A program that runs while a condition is true; what follows waits until the condition is false."""
+    """A loop that runs a program while a condition is true; the parts after the loop wait until it is false."""
 
     condition: Expression
     body: Node

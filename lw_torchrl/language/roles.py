@@ -211,7 +211,7 @@ _SKILLS, _WAYS = WORDS["roles"]["skills"], WORDS["roles"]["ways"]
 class StepRole:
     """The meaning of one plan step, as parsed by :func:`~lw_torchrl.canonical_plan`.
 
-    Objects have their names in the task; the goal is "target location".
+    Objects are named as in the task, and the goal is named "target location".
     """
 
     verb: Verb

@@ -107,7 +107,7 @@ def _tagged(text: str) -> tuple[list[tuple[int, int]], bool]:
 
 
 def _marked(text: str) -> Iterator[tuple[int, int]]:
-    """Yield the spans between balanced markers."""
+    """Yield the (start, end) spans of reasoning between balanced markers, including the markers."""
     end, opened = 0, dict[str, int]()
     for marker in _MARKER.finditer(text):
         if marker.start() < end:

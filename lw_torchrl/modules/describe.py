@@ -75,7 +75,7 @@ def _encode_module(module: nn.Module, plans: list[Plans], path: str) -> dict[str
     else:
         options = getattr(module, "config", None)
         if not isinstance(options, Mapping):
-            raise TypeError(f"{where} cannot be saved: add config, the arguments of {kind.__qualname__}(...)")
+            raise TypeError(f"{where} cannot be saved: give {kind.__qualname__} an attribute config, its arguments")
         if "plans" not in options and "plans" in signature(getattr(kind, "rebuild", kind)).parameters:
             options = {"plans": module.plans, **options}
         name = kind.__name__ if kind.__module__.startswith("lw_torchrl.") else f"{kind.__module__}:{kind.__qualname__}"
@@ -100,7 +100,7 @@ def _encode(value: Any, plans: list[Plans], path: str) -> Any:
         return {"layout": METAWORLD.name if value == METAWORLD else value.to_json()}
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return {"dict": {key: _encode(each, plans, _join(path, key)) for key, each in value.items()}}
-    raise TypeError(f"{path} must be a JSON value, plans, a task, a layout or a module to be saved, got {shown(value)}")
+    raise TypeError(f"{path} cannot be saved: use a JSON value, Plans, Task, Layout or nn.Module, got {shown(value)}")
 
 
 def _join(path: str, name: str) -> str:

@@ -188,7 +188,7 @@ def _limited(openai: Any, timeout: float, refusals: int) -> Any:
     """Return a subclass of the ``openai`` package's HTTP client that limits the time and the size of each reply.
 
     The timeout of ``openai`` applies to each read, so a server that sends a byte now and then would never time out.
-    A refused connection is retried at most ``refusals`` times, because a server that is not running seldom starts then.
+    A refused connection is retried at most ``refusals`` times: a server that is not running seldom starts meanwhile.
     """
 
     class LimitedClient(openai.DefaultHttpxClient):

@@ -49,7 +49,7 @@ def entity_path(*parts: str) -> str:
 
 
 def changes(values: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the indices of the first row of T×K values and of all rows that differ from the row before."""
+    """Return the indices of the rows of T×K values that differ from the previous row, and of the first row."""
     return np.flatnonzero(np.concatenate([[True], (values[1:] != values[:-1]).any(axis=1)]))
 
 

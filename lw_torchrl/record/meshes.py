@@ -281,6 +281,6 @@ def _packed(indices: NDArray[np.int64], base: int = 1 << 20) -> NDArray[np.int64
 
 
 def _means(values: NDArray[np.float64], group: NDArray[np.int64], groups: int) -> NDArray[np.float64]:
-    """Return the mean (groups×3) of N×3 values in each group."""
+    """Return the mean of N×3 ``values`` in each group, as an array groups×3."""
     count = np.bincount(group, minlength=groups)
     return np.stack([np.bincount(group, column, minlength=groups) / count for column in values.T], axis=1)

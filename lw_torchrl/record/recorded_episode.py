@@ -112,7 +112,7 @@ class RecordedEpisode:
 
     @property
     def first_success(self) -> int | None:
-        """The first time step at which the task is solved: one after the row whose action solved the task."""
+        """The first time step at which the task is solved: one step after the row whose action solved the task."""
         if self.success is None or not self.success.any():
             return None
         return int(self.success.argmax()) + 1
@@ -174,7 +174,7 @@ class RecordedEpisode:
                 return None
             array, needed = column(key, None), 1 if flat else len(steps)
             if array.shape[1] < max(needed, 1):
-                raise ValueError(f"rollout[{key!r}] must have {needed} columns, got {array.shape[1]}")
+                raise ValueError(f"rollout[{key!r}] must have at least {max(needed, 1)} columns, got {array.shape[1]}")
             array = array > 0.5 if truth and array.dtype != np.bool_ else array
             return array[:, 0] if flat else array[:, : needed or None]
 

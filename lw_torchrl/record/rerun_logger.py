@@ -38,7 +38,7 @@ MOST_CURVES = 64  # maximum number of curves with the same name
 BAR_COLOR = (80, 170, 255)
 BUFFERED_SCALARS = 1024
 SEND_SECONDS, SEND_SHARE = 0.5, 0.01
-"""The minimum time in seconds, and as a fraction of the logger's age, between two transmissions of buffered scalars."""
+"""The minimum time between two transmissions of buffered scalars: in seconds, and as a fraction of the logger's age."""
 FLUSH_SECONDS = 5.0
 
 
@@ -145,7 +145,7 @@ class RerunLogger(Logger):
             self._send(now=len(values) >= BUFFERED_SCALARS)
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
-        """Add a video "videos/<name>" as JPEG images, with frame i at time step i of the episodes' timelines.
+        """Log a video as "videos/<name>" in JPEG images, with frame i at time step i of the episodes' timelines.
 
         Args:
             video: a video T×C×H×W or 1×T×C×H×W uint8 (C = 1 or 3).
@@ -180,7 +180,7 @@ class RerunLogger(Logger):
             self._send()
 
     def log_histogram(self, name: str, data: Sequence[float] | Tensor | NDArray[Any], **kwargs: Any) -> None:
-        """Add a histogram "histograms/<name>", a bar chart on the timeline "global_step".
+        """Log a histogram as "histograms/<name>", a bar chart on the timeline "global_step".
 
         Args:
             name: the histogram's name.
@@ -219,7 +219,7 @@ class RerunLogger(Logger):
         closing = threading.Thread(target=self.experiment.disconnect, daemon=True)
         closing.start()
         wait = FLUSH_SECONDS if timeout is None else timeout
-        closing.join(wait if self.connect is None else wait + 4 * FLUSH_SECONDS)  # Rerun tries to connect once more
+        closing.join(wait if self.connect is None else wait + 4 * FLUSH_SECONDS)  # Rerun tries to reconnect once
         if closing.is_alive():
             rr.unregister_shutdown()
         if self.path is not None and not is_complete(self.path):

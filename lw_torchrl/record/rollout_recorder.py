@@ -20,7 +20,7 @@ from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollouts import read_rollout
 from lw_torchrl.transforms.environment import base_env, refuse_changed
 
-# The keys of a LanguageWorldEnv that are recorded before a time step, and after a time step.
+# The keys of a LanguageWorldEnv whose values are recorded: before a time step, and after a time step.
 _BEFORE = {"task_id", "episode", "qaf_plan", "observation", "qaf", "qaf_logits", "skill_weights", "pixels"}
 _AFTER = {"executed_action", "success", "reward"}
 

@@ -260,7 +260,7 @@ def run_recorded(
         steps = episode.steps
         if learned and "qaf_logits" not in steps.keys():
             steps = learned[0](steps.to(device_of(learned[0]))).cpu()
-        if has_answers and own_plans is not None:  # add the exact truth values to those that the policy used
+        if has_answers and own_plans is not None:  # add exact truth values to the evaluator's
             if "qaf_logits" not in steps.keys():
                 steps.set("qaf_logits", 10.0 * steps.get("qaf").float() - 5.0)
             answer = QAFTransform(own_plans)

@@ -31,8 +31,8 @@ FOCAL, LABEL, LETTER = 160.0, 26.0, 6.5
 """Focal length, height of a label and width of a letter, in pixels of the scene view in a window of 1100×700."""
 
 Point = tuple[float, float, float]
-# Camera position and target: from behind the robot's right shoulder; with the arm, from the front. The center of the
-# table is at (0, 0.6, 0).
+# Camera position and target, from behind the robot's right shoulder: without the arm, and with the arm. The center of
+# the table is at (0, 0.6, 0).
 SIMPLE_EYE: tuple[Point, Point] = ((0.54, 0.23, 0.46), (0.03, 0.63, 0.10))
 ROBOT_EYE: tuple[Point, Point] = ((0.54, 0.18, 0.47), (-0.02, 0.62, 0.13))
 
@@ -88,7 +88,7 @@ def log_scene(
             stream.send_columns(f"{scene}/{path}", episode.times(rows), rr.Points3D.columns(positions=position[rows]))
 
     def named_point(path: str, name: str, radius: float, color: Color) -> None:
-        """Draw a point with a label, which is moved away if it would overlap another label."""
+        """Draw a point with a label; the label is moved if it would overlap another label."""
         away = offsets[name]
         point(path, positions[name], None if away.any() else name, radius, color)
         if away.any():

@@ -162,7 +162,7 @@ class Tabs:
         raise unknown_name("episode", str(name), [tab.name for tab in tabs])
 
     def _has_overview(self) -> bool:
-        """Return whether an overview tab is needed, because several episodes do not form a single comparison."""
+        """Return whether an overview tab is needed: there are several episodes, and not exactly one comparison."""
         return len(self.pages) > 1 and len(self._compared) != 1
 
 

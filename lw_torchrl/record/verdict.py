@@ -16,7 +16,7 @@ from lw_torchrl.record.entities import FALSE, STEEL, Color, changes, rr, step_co
 from lw_torchrl.record.recorded_episode import NO_STEP, Ghost, RecordedEpisode
 
 AFTER_SUCCESS, AROUND_FAILURE = 8, 60
-"""The numbers of time steps to show after the first success, and on both sides of the first sign of a failure."""
+"""The number of time steps to show after the first success, and before and after the first sign of a failure."""
 LONGEST = 200  # maximum number of time steps to show from the ghost's divergence to the failure
 LINE, MOST_LINES = 78, 2
 """The number of characters per line in a 1100×700 window, and the maximum number of lines for a condition."""
@@ -248,7 +248,7 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     if reward is not None and not (episode.success is not None and np.array_equal(reward, episode.success)):
         send("reward", reward[:, None], ["reward"], STEEL, later=1)
     weights = episode.skill_weights
-    if weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any()):  # else see the timeline
+    if weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any()):  # else the timeline suffices
         texts = [f" {skill}" for _, skill in episode.steps] or [""] * weights.shape[1]
         send("skill_weights", weights, [f"{i}{text}" for i, text in enumerate(texts, 1)])
     return logged

@@ -158,8 +158,8 @@ def damaged(recording: Path) -> Iterator[None]:
 
 @contextmanager
 def readable(recording: Path) -> Iterator[Path]:
-    """Yield the path of a recording, or of a repaired copy if the recording was not closed properly; otherwise Rerun
-    would wait for the rest of the incomplete file. A child process reads the file first, because Rerun trusts the sizes
+    """Yield the path of a recording, or of a repaired copy if the recording was not closed properly, because Rerun
+    would wait for the rest of an incomplete file. A child process reads the file first, because Rerun trusts the sizes
     that a file declares."""
     with tempfile.TemporaryDirectory() as folder:
         file = recording

@@ -26,7 +26,7 @@ _SWITCHED_OFF = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECT
 
 def _open_gl() -> Any:
     """Open a windowless OpenGL context with the library in MUJOCO_GL (if unset: EGL when there is no display)."""
-    # MuJoCo reads MUJOCO_GL when it is imported, but robosuite sets the variable later.
+    # MuJoCo reads MUJOCO_GL when it is imported, but robosuite sets the variable after that import.
     headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     backend = os.environ.get("MUJOCO_GL", "").lower().strip() or ("egl" if headless else "")
     if backend == "egl":

@@ -19,11 +19,11 @@ from lw_torchrl.suites.suite import Suite
 Array = NDArray[np.float64]
 _Row = tuple[str, str, str, bool | None]  # the fields of a Finding, without the task
 _AXES = {"x": "right", "y": "away from the robot", "z": "up"}
-# The hand's speed is measured over the last time steps of a movement at a quarter of full speed, after it accelerated.
+# The hand's speed is measured over the last time steps of a movement at a quarter of full speed, after the start-up.
 _STEPS, _COUNTED, _SHARE = 14, 4, 0.25
-_SETTLING = 30  # time steps in which a gripper opens or closes
+_SETTLING = 30  # time steps that a gripper may need to open or close
 _RESTED = 4  # episodes in which the hand rests
-_LAG, _CLOSING = 4, 13  # time steps in Meta-World in which the hand comes to rest, and in which the gripper closes
+_LAG, _CLOSING = 4, 13  # time steps until the hand is at rest and until the gripper is closed, in Meta-World
 _LOWEST = 0.15  # metres: the maximum height of a hand pressed down onto the table; 0.046 in Meta-World
 _TABLE, _FLOATING = 0.02, 0.03  # metres: lower objects lie on the table; higher objects are deliberately elsewhere
 
@@ -103,7 +103,7 @@ class _Bench:
         yield from self._axes() if self.layout.displacement is not None else ()
         yield from self._gripper() if self.layout.gripper is not None else ()
         yield from self._objects()
-        successes = 0  # by chance, an episode may start where it succeeds
+        successes = 0  # an episode may happen to start in a success state
         for seed in range(self.seed, self.seed + _RESTED):
             self.reset(seed)
             successes += any(self.step().success[0] for _ in range(_SETTLING))

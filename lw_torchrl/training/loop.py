@@ -26,7 +26,7 @@ from lw_torchrl.training.minibatches import Minibatches
 from lw_torchrl.training.normalization import share_contacts
 
 READ_EVERY = 100
-"""Number of optimizer steps between two transfers of the losses to the CPU, which wait for the device."""
+"""Number of optimizer steps between transfers of the losses to the CPU; each transfer waits for the device."""
 
 
 def make_optimizer(

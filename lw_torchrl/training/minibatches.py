@@ -123,7 +123,8 @@ def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, s
     for network, answered in product(networks, map(plans_of, replay.transform)):
         own = plans_of(network)
         if own is not None and answered is not None and (different := answered.differences(own)):
-            raise ValueError(f"replay's QAFTransform must use the actor's plans; they differ in {', '.join(different)}")
+            problem = f"QAFTransform must use {type(network).__name__}'s plans; they differ in {', '.join(different)}"
+            raise ValueError(f"replay: {problem}")
     if replay._prefetch:
         raise ValueError("replay must not prefetch: prefetched batches would be lost when training resumes")
     if replay.batch_size not in (None, size):

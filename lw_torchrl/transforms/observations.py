@@ -76,7 +76,7 @@ class CameraTransform(KeepsEnvState):
             raise TypeError(f"CameraTransform needs a LanguageWorldEnv (in each worker), got {name}")
 
     def _draw(self, which: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
-        """Render the images of the rows ``which`` (N,) bool, and write the images of all N rows."""
+        """Render images of the rows selected by ``which`` (N,) bool, and write the latest images of all N rows."""
         env: Any = base_env(self)
         rows = which.nonzero().flatten()
         if self._taken is None:

@@ -1,4 +1,4 @@
-"""QAFTransform, which answers the conditions of each row's plan, and CorruptQAF, which makes answers late or wrong."""
+"""QAFTransform, which checks the conditions of each row's plan, and CorruptQAF, which delays or flips the answers."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def read_truth(tensordict: TensorDictBase, keys: Keys, tables: PlanTables) -> tu
     qaf, task_id = read(tensordict, keys)
     qaf, rows = answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), tables)
     if qaf.shape != (shape := (*rows.shape, tables.mask.shape[-1])):
-        raise ValueError(f"qaf must have shape {shape}, got {tuple(qaf.shape)}; give QAFTransform the same plans")
+        raise ValueError(f"qaf must have shape {shape}, got {tuple(qaf.shape)}; give QAFTransform this module's plans")
     if qaf.dtype != torch.bool:
         problem = "qaf must be bool, or numbers from 0 to 1 (soft truth), but holds NaN or other numbers"
         check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)

@@ -106,5 +106,5 @@ def test_a_buffer_of_other_plans_of_the_same_length_is_refused(demos):
     """The answers have the right shape but belong to other conditions, so the mistake would pass unnoticed."""
     plans = lw.Plans({**PLANS, "reach": lw.ConditionalPlan("reach", PLANS["reach"].steps[::-1])})
     replay = lw.LanguageWorldExperienceReplay(demos, transform=lw.QAFTransform(plans))
-    with pytest.raises(ValueError, match=r"the actor's plans; they differ in reach"):
+    with pytest.raises(ValueError, match=r"PlanConditionedActor's plans; they differ in reach"):
         BehavioralCloningTrainer(make_actor(), replay, CONFIG)

@@ -250,7 +250,7 @@ def assert_refused(loss, replay, message):
 
 def test_a_buffer_of_other_plans_is_refused(demos):
     others = lw.Plans([lw.ConditionalPlan(plan.task, plan.steps[::-1]) for plan in PLANS.values()])
-    assert_refused(make_loss("value"), make_replay(demos, others), "the critic's plans")
+    assert_refused(make_loss("value"), make_replay(demos, others), "s plans; they differ in")
 
 
 @pytest.mark.parametrize("name", ["RandomYaw", "JitterTarget"])

@@ -153,7 +153,7 @@ def exported_columns(table: ImportedTable) -> dict[str, Array]:
 
 
 def complete_columns(table: ImportedTable, suite: Suite) -> tuple[dict[str, Array], list[str]]:
-    """Return all columns of a dataset from an imported table, and an explanation for each column that it lacks."""
+    """Return all columns of a dataset, built from an imported table, and a note on each column that the table lacks."""
     rows, lacking = table.rows, [*table.notes]
     used = ["observation", "action", "next_observation", "reward_dense"]
     used.append("success" if "success" in table.columns else "reward_sparse")  # other columns must not cause errors

@@ -232,7 +232,7 @@ def _numbers(name: str, column: Any) -> Array:
 
 
 def _whole(name: str, column: Array) -> Array:
-    """Return a column of indices as integers; raise :class:`Refused` for other numbers, such as NaN."""
+    """Convert a column of indices to integers; raise :class:`Refused` if a number is not whole, such as 0.5 or NaN."""
     column = column.reshape(len(column))
     if column.dtype.kind == "f" and (odd := column[~(np.isfinite(column) & (column == np.round(column)))]).size:
         raise Refused(f"{name} must hold whole numbers, but holds {odd[0]}")

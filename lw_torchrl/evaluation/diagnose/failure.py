@@ -154,7 +154,7 @@ class Failure:
         return ""
 
     def to_json(self) -> dict[str, Any]:
-        """Return all fields except :attr:`mended`, and :attr:`why`, as JSON."""
+        """Convert all fields except :attr:`mended` to JSON, and include the text of :attr:`why`."""
         content = {each.name: getattr(self, each.name) for each in fields(self) if each.compare} | {"why": self.why}
         return content if self.finding is None else {**content, "finding": vars(self.finding)}
 

@@ -40,7 +40,7 @@ class Motion(NamedTuple):
         return Motion(*(torch.cat(both) for both in zip(self, other, strict=True)))
 
     def of(self, entries: Tensor) -> Motion:
-        """Restrict the motion to the action entries that ``entries`` (A,) bool selects, and to known right actions."""
+        """Select action entries with the mask ``entries`` (A,) bool, and only states whose right action is known."""
         known = (self.active >= 0) & self.wanted.isfinite().all(-1)
         return Motion(self.wanted[known][:, entries], self.done[known][:, entries], self.active[known])
 
@@ -143,7 +143,7 @@ class FailedEpisode:
 
     @property
     def late(self) -> int:
-        """The number of last states, at most 100, in which the episode made no progress."""
+        """The number of final states that are assumed to show no progress: 100, or all states of a shorter episode."""
         return min(_LATE, len(self.active))
 
     @property
@@ -256,7 +256,7 @@ def blame_plan(failed: FailedEpisode, compared: Departures) -> Blame:
 
 
 def departures(failed: FailedEpisode, scripts: Scripts, trusted: Scripts) -> Departures:
-    """Compare the actions that an episode's plan and the reference plan in ``trusted`` request in its states."""
+    """Compare the actions that a plan and the reference plan in ``trusted`` request in each state of an episode."""
     steps, plan, other = failed.plain.steps, failed.plan, trusted.plans[failed.task]
     ours, theirs = chosen(failed.truth, len(plan.steps)), chosen(exact_answers(other, steps), len(other.steps))
     inputs, rows = (steps.get("observation"), steps.get("task_id")), torch.arange(len(ours))

@@ -1,4 +1,4 @@
-"""Values of expressions in code: texts that depend on conditions, distances, and conditions."""
+"""Values of expressions in code: conditions, distances, and texts that depend on conditions."""
 
 from __future__ import annotations
 

@@ -282,7 +282,7 @@ def _by_urgency(rows: list[dict[Any, Any]]) -> list[dict[Any, Any]]:
 
 
 def _without_header(row: dict[Any, Any]) -> dict[Any, Any]:
-    """Convert the rows of a table to objects whose keys are the table's header, which is another field."""
+    """Convert a table whose header is in a separate field: each row becomes an object with the header as keys."""
     for name, header in row.items():
         for key, table in row.items():
             if isinstance(header, list) and isinstance(table, list) and (rows := _zipped(header, table)):

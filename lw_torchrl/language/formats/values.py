@@ -1,4 +1,4 @@
-"""JSON, YAML and XML as language models write them: with comments, trailing commas, missing brackets, text around."""
+"""Parse JSON, YAML and XML from language models: with comments, trailing commas, missing brackets or extra text."""
 
 from __future__ import annotations
 

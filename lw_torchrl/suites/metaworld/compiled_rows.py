@@ -113,7 +113,7 @@ class CompiledRows:
         stable, counts = np.zeros(len(rows), dtype=bool), np.zeros(2, np.int64)
         handler, caller = self._kernel.leave_mujoco.address, get_ident()
 
-        def simulate() -> None:  # refers to self, so that MuJoCo's states stay while a thread is busy
+        def simulate() -> None:  # refers to self, which keeps MuJoCo's states alive for busy threads
             waits = get_ident() == caller
             self._kernel.simulate(handler, self._table, rows, order, counts, inputs, outputs, stable, waits)
 

@@ -285,7 +285,7 @@ FULL_REWARD = 10.0
 
 
 class EpisodeStarts:
-    """The values from each row's first state of the episode that the row's reward depends on."""
+    """Values of the first state of each row's episode, as far as the reward of the row depends on them."""
 
     def __init__(self, rewards: Sequence[TaskReward]) -> None:
         self.rewards = tuple(rewards)

@@ -1,4 +1,4 @@
-"""Meta-World's own environments: an engine that steps them in a loop, and their resets on models that rows share."""
+"""Meta-World's own environments: an engine that steps the environments in a loop, and resets with shared models."""
 
 from __future__ import annotations
 
@@ -100,8 +100,8 @@ Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 class SharedModel:
     """A compiled model that many rows use in turn. Meta-World's resets change the positions of bodies and sites in the
-    model itself, so each row stores its own positions, and loads them before it uses the model, unless it was the last
-    row to do so (the ``holder``)."""
+    model itself, so each row stores its own positions. A row loads its positions before it uses the model, unless it
+    was the last row to load positions (the ``holder``)."""
 
     def __init__(self, path: str, model: Any, compiled: Places | None = None) -> None:
         self.path, self.model = path, model
@@ -124,7 +124,7 @@ _idle: dict[str, SharedModel] = {}
 
 
 def borrow_model(path: str) -> SharedModel:
-    """For an XML file, return a model that no other engine is using; each process compiles a file only once."""
+    """Return a compiled model of an XML file for use by one engine; each process compiles a file only once."""
     with _lock:
         if (idle := _idle.pop(path, None)) is not None:
             return idle
@@ -146,8 +146,8 @@ def return_models(models: Iterable[SharedModel]) -> None:
 
 
 WARNED_ALREADY = 1000
-"""The initial value of MuJoCo's warning counts. MuJoCo prints and logs (MUJOCO_LOG.TXT) a warning only if its count is
-zero, so this value silences it; another count means that a warning occurred."""
+"""The initial value of MuJoCo's warning counts. MuJoCo prints a warning, and logs it to MUJOCO_LOG.TXT, only if
+its count is zero, so this value silences all warnings; any other count means that a warning occurred."""
 
 
 class TaskProgram:

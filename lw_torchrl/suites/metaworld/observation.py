@@ -186,7 +186,7 @@ class SuccessFunction:
             np.array([getattr(row, name) for row in success], np.float64)
             for name in ("offset", "axes", "within", "under", "above", "angle")
         )
-        # A distance is at most ``within`` if it is less than the next larger number.
+        # A distance is at most ``within`` if it is less than the next larger float64.
         self._nearer_than = np.minimum(np.nextafter(self._within, np.inf), self._under)
         columns = {"object": OBJECT.start, "second": SECOND.start}
         self._columns = np.array([[columns.get(row.point, POINT.start)] for row in success]) + np.arange(3)

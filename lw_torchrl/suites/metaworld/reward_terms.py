@@ -96,7 +96,7 @@ def _points(reward: TaskReward) -> list[list[list[list[int]]]]:
 
 
 def _less(term: Term) -> float:
-    """Return the number ``less`` in a margin ``abs(distance - less)``; the distance is 0 for a constant margin."""
+    """Return ``less`` for a margin ``abs(distance - less)``; a constant margin is ``less``, with distance 0."""
     if isinstance(term.margin, tuple):
         return term.less
     if term.margin == FIRST_DISTANCE:

@@ -201,7 +201,7 @@ def simulate(
         end = _seconds(scratch)
         row.seconds, start = end - start, end
         add_atomically(done, 1)
-    # The last rows take less than a millisecond, and a thread that sleeps wakes up late.
+    # Do not sleep: the last rows take less than a millisecond, and a sleeping thread wakes up late.
     while waits and add_atomically(done, 0) < len(order):
         sched_yield()
     set_error_handler(other_handler)
@@ -213,7 +213,7 @@ def model_with_places(model: Any, places: Places) -> NDArray[np.int64]:
     All other arrays of the model are shared, so each row can have a model with its own positions. The model must
     outlive the copy.
     """
-    # No function returns the size of the struct, but it fills a block of memory.
+    # MuJoCo does not report the size of the struct, but the struct fills a block of memory.
     size = _size_of_block(model._address)
     struct = np.frombuffer((ctypes.c_char * size).from_address(model._address), np.int64, size // 8).copy()
     for array, own in zip((model.body_pos, model.site_pos), places, strict=True):

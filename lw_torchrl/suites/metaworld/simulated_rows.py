@@ -132,7 +132,7 @@ class RowGroup:
 
 
 def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
-    """Group rows by key, and split each group that is larger than half of a thread's share of all rows."""
+    """Group rows by key, and split each group that has more than half as many rows as a thread's share."""
     by_key: dict[str, list[int]] = defaultdict(list)
     for row, key in enumerate(keys):
         by_key[key].append(row)
@@ -170,7 +170,7 @@ class WorkerPool:
         self._idle = False
         self._call[0] = call
         for wake in self._wake[:helpers]:
-            if wake.locked():  # otherwise this thread has not yet noticed that it was woken up before
+            if wake.locked():  # otherwise the helper has not yet noticed its previous wake-up
                 wake.release()
         call()
         self._call[0] = _do_nothing
@@ -229,7 +229,7 @@ def _help(wake: threading.Lock, busy: threading.Lock, call: list[Callable[[], ob
             if (now := call[0]) is None:
                 return
             now()
-            del now  # it refers to the rows of a step
+            del now  # else the rows of a step stay in memory
 
 
 def _stop(call: list[Callable[[], object] | None], wakes: Sequence[threading.Lock]) -> None:
@@ -289,7 +289,7 @@ class ThreadedEngine(SeenRows):
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
         index, seed_of = np.array(rows, dtype=np.intp), dict(zip(rows, seeds, strict=True))
-        # If a reset fails half-way, the rows must not be stepped.
+        # If the reset fails half-way, the rows stay marked as not started, so they cannot be stepped.
         self._started[index] = False
         self._pool.work(self._by_group(index), lambda row: self._reset_row(row, seed_of[row]))
         if self._compiled is not None:
@@ -309,7 +309,7 @@ class ThreadedEngine(SeenRows):
         self._faulted |= active & ~np.isfinite(action).all(axis=1)
         reward, success = np.zeros(n), np.zeros(n, dtype=bool)
         if (rows := np.flatnonzero(active & ~self._faulted)).size:
-            # If a step is interrupted, the rows must be reset.
+            # If the step is interrupted, the rows stay marked as not started, so they must be reset.
             self._started[rows] = False
             self._step_running(rows, action, reward, success)
             self._started[rows] = True

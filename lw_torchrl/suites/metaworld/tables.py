@@ -141,7 +141,7 @@ class TaskReward:
 
     @property
     def terms(self) -> tuple[Term, Term, Term, Term]:
-        """The terms near, placed and via, and the distance of tcp and object along x and z."""
+        """The terms near, placed and via, and the term for the distance between tcp and object along x and z."""
         across = Term()
         if (cage := self.cage) is not None:
             margin = cage.start, "tcp at start"
