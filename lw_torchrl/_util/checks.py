@@ -54,8 +54,8 @@ class ArgumentError(TypeError, ValueError):
 
 
 def typed(function: Function) -> Function:
-    """Decorate a function to pass each argument through :func:`check_value` with its annotation, except ``*args``,
-    ``**kwargs`` and arguments whose type is imported only for type checkers (:func:`as_plans` checks ``plans``)."""
+    """Decorate a function to check each argument against its annotation with :func:`check_value`, except ``*args``,
+    ``**kwargs`` and arguments whose types are imported only for type checkers (:func:`as_plans` checks ``plans``)."""
 
     def read_hints() -> dict[str, Any]:
         hints: dict[str, Any] = {}

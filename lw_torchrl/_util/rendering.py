@@ -15,7 +15,7 @@ _LARGEST = 4096  # pixels along a side
 
 
 def check_picture(camera: str, height: int, width: int, most: int = _LARGEST) -> None:
-    """Raise a :class:`ValueError` if the camera is unknown or the height or width is not from 1 to ``most`` pixels."""
+    """Raise a :class:`ValueError` if the camera is unknown, or the height or width is not in [1, ``most``] pixels."""
     check_choice("camera", camera, CAMERAS)
     if max(check_value("height", height, Count), check_value("width", width, Count)) > most:
         raise ValueError(f"height and width must be at most {most} pixels, got {height} and {width}")

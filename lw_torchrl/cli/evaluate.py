@@ -250,7 +250,7 @@ def _show_plan_use(output: Output, result: lw.EvaluationResult, use: lw.evaluati
 
 
 def _default_tasks(policy: Any, demonstrated: set[str], suite: lw.suites.Suite | None) -> list[str]:
-    """Return the policy's tasks that have demonstrations (all tasks if none has) and that a suite can simulate."""
+    """Return the policy's tasks that have demonstrations (all if none has), except tasks that no suite can simulate."""
     from lw_torchrl.suites.suite import known_suite
 
     if (known := lw.modules.tasks_of(policy)) is None:

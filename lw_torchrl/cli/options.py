@@ -60,7 +60,7 @@ class Output:
         return self
 
     def result(self, result: lw.EvaluationResult, **more: Mapping[str, Any]) -> Output:
-        """Print an evaluation's table, or add the results, the config and ``more`` columns by task to the document."""
+        """Print an evaluation's table, or add the results by task (with the columns ``more``) and the config."""
         rates = ("success_once", "success_at_end", "first_success", "mean_return")
         columns = {name: getattr(result, name) for name in rates} | more
         rows = [{"task": task, **{name: of[task] for name, of in columns.items()}} for task in result.config["tasks"]]

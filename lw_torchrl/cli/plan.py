@@ -230,8 +230,8 @@ class Read:
         return output
 
     def _plans(self, source: str) -> list[tuple[lw.ConditionalPlan, DecodedPlan | None]]:
-        """Return the plans in a source; with --task, only that task's plan. A plan decoded from a language model's
-        answer comes with the :class:`DecodedPlan`, any other plan with None."""
+        """Return the plans in a source; with --task, only that task's plan. Each plan is paired with the
+        :class:`DecodedPlan` if it was decoded from a language model's answer, otherwise with None."""
         file = Path(source)
         if file.is_file() and (options.is_answer(file) or (self.scripted and file.suffix == ".plan")):
             return self._decoded(file)

@@ -33,7 +33,7 @@ class PlanLike(Protocol):
 
 
 class TargetPose(NamedTuple):
-    """Positions (T×3, metres) of a skill's target and moved object, which are equal on uncontrolled axes."""
+    """Positions (T×3, metres) of a skill's target and of the moved object; equal on axes that the skill ignores."""
 
     position: NDArray[np.float32]
     moved: NDArray[np.float32]

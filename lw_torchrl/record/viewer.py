@@ -101,7 +101,7 @@ def open_viewer(
                     files[-1] = folder / f"{number}.rrd"
                     ids = {"application_id": known.application_id, "recording_id": known.recording_id}
                     reader.stream().write_rrd(files[-1], **ids)
-                if tabs is not None and (own_front is not None or not reader.blueprints()):  # it was never closed
+                if tabs is not None and (own_front is not None or not reader.blueprints()):  # it was not closed
                     layouts.append(folder / f"{number}.rbl")
                     tabs.blueprint(own_front).save(known.application_id, str(layouts[-1]))
         if len(unknown) == len(files):

@@ -66,7 +66,7 @@ PUSH = '["push it"]\ntarget = "puck"\n'
         (PUSH + "for = 3", "'push it': 'for'"),
         (PUSH + 'for.pusch.target = "puck"', "did you mean 'push'"),
         ('"push it" = 3\n', "'push it': .*table, got 3"),
-        ('["push it"]\ntarget = 3\n', "'push it': the skill must have target"),
+        ('["push it"]\ntarget = 3\n', "'push it': target"),
         *((PUSH + f"offset = {wrong}", "'push it': offset") for wrong in ("[0, 1]", "[0, 0, inf]", "3")),
         *((PUSH + f"gain = {wrong}", "'push it': gain") for wrong in ("-1", '"much"')),
     ],

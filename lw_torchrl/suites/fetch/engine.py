@@ -168,9 +168,9 @@ class FetchEngine(ThreadedEngine):
     step. The gripper effort is relative to the current finger positions, so an effort of 0 does not hold the puck.
     Reach, push and slide keep the fingers closed.
 
-    Observations (25 values, :data:`~lw_torchrl.suites.fetch.FETCH`) are in metres and in Meta-World's axes. Reach
-    has no object (zeros), and its goal is a hand position, 3 cm above the grip site's goal. Errors in a row are
-    handled as in :class:`~lw_torchrl.suites.metaworld.vectorized_engine.VectorizedEngine`.
+    Observations (25 values, :data:`~lw_torchrl.suites.fetch.FETCH`) are in metres and in Meta-World's axes. In
+    reach, the object's values are 0 and the goal is a hand position, 3 cm above the grip site's goal. Errors in a row
+    are handled as in :class:`~lw_torchrl.suites.metaworld.vectorized_engine.VectorizedEngine`.
 
     Args:
         tasks: the task of each row.

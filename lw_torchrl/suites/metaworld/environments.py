@@ -46,7 +46,7 @@ def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
 
 
 class MetaWorldEngine(SeenRows):
-    """An engine that runs Meta-World's own environments in a loop: slow, and the vectorized engine's reference."""
+    """An engine that runs Meta-World's own environments in a loop: slow, but the vectorized engine's reference."""
 
     @typed
     def __init__(

@@ -154,7 +154,7 @@ class WorkerPool:
         self._wake, self._busy = ([threading.Lock() for _ in range(self._helpers)] for _ in range(2))
         for wake, busy in zip(self._wake, self._busy, strict=True):
             wake.acquire()
-            # A daemon, because it waits inside acquire() when Python exits. It keeps no reference to the pool.
+            # A daemon thread, because it is inside acquire() when Python exits. It holds no reference to the pool.
             threading.Thread(target=_help, args=(wake, busy, self._call), name="lw_torchrl", daemon=True).start()
         self._stop = weakref.finalize(self, _stop, self._call, self._wake)
         self._stop.atexit = False
