@@ -53,7 +53,7 @@ def asserted(*tensors: Tensor) -> bool:
 
 
 def check_values(holds: Callable[[Tensor], Tensor], tensor: Tensor, problem: str) -> None:
-    """Raise a :class:`ValueError` unless ``holds(tensor)``; in compiled code and on GPUs, a later RuntimeError."""
+    """Raise a :class:`ValueError` unless ``holds(tensor)``. Compiled code and GPUs raise a RuntimeError later."""
     if asserted(tensor):
         torch._assert_async(holds(tensor), problem)
     elif readable(tensor) and not holds(tensor):

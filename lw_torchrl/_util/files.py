@@ -237,9 +237,9 @@ def reading(path: AnyPath, what: str) -> Iterator[None]:
 
 
 _MB = 10**6
-# Each limit is a constant plus a multiple of the files' size. The multiple allows for compressed files.
+# Each limit is a constant plus a multiple of the files' size. The multiple is large, because files may be compressed.
 _SECONDS, _BYTES_PER_SECOND = 30, _MB
-_PATIENCE = 4  # wall-clock limit divided by the CPU-time limit; a process may have to wait for a busy machine
+_PATIENCE = 4  # ratio of the wall-clock limit to the CPU-time limit, because the machine may be busy
 _MEMORY, _MEMORY_PER_BYTE = 700 * _MB, 200
 
 

@@ -220,7 +220,7 @@ def _skill_notes(plan: lw.ConditionalPlan, skills: Mapping[str, ScriptedSkill]) 
 
 
 def _check_toml(output: Output, file: Path, known: Mapping[str, Task]) -> Output:
-    """Validate a .toml file, which holds tasks or skills depending on its keys."""
+    """Validate a .toml file; the keys determine whether the file defines tasks or skills."""
     notes: list[str] = []
     try:
         rows = read_toml(file, ValueError)

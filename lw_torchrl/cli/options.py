@@ -206,7 +206,7 @@ def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> 
 
 
 def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite | None:
-    """Load the suite ``name`` or, if None, the suite of ``tasks`` ("fetch" or "fetch/push"); None means Meta-World."""
+    """Load the suite ``name`` or, without a name, the suite of ``tasks`` ("fetch/push"); return None for Meta-World."""
     from lw_torchrl.suites.suite import Suite, find_suite, load_suite, suite_name
 
     if name is None:

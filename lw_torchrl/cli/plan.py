@@ -286,8 +286,8 @@ def _tree(notes: Sequence[Row], report: CanonicalReport, decoded: DecodedPlan | 
     """Return the rows of a plan's tree: branch heads, and steps as in :meth:`CanonicalReport.notes`.
 
     The row of a step also has the step's ``line`` in the text, the ``path`` of heads above the step, and the reason why
-    the step was ``dropped``, or None. Clauses that did not become steps follow at the end, then the steps that replace
-    the plan's steps.
+    the step was ``dropped``, or None. At the end come the clauses that did not become steps, and then the steps that
+    replace the plan's steps.
     """
     from lw_torchrl.language.canonical import SOURCES
 

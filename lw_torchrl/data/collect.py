@@ -137,7 +137,7 @@ def _env_and_actor(config: CollectConfig, policy: Any, env: LanguageWorldEnv) ->
 
 
 def suite_expert(suite: Suite, tasks: Sequence[str]) -> Any:
-    """Return a suite's expert or an actor with its scripted skills and plans; raise ValueError if it has neither."""
+    """Return a suite's expert, or else an actor with the suite's scripted skills; raise ValueError without either."""
     if suite.make_expert is not None:
         return suite.make_expert(tasks)
     if suite.plans is None or suite.skills is None:
@@ -154,7 +154,7 @@ def run_missing_episodes(
     progress: bool,
     workers: int | None = 1,
 ) -> dict[str, list[int]]:
-    """Run episodes until all are in the files, and return the indices of the kept episodes of each task."""
+    """Run the missing episodes, write them to the files, and return the kept episodes' indices by task."""
 
     def run(part: Episodes, on_steps: Callable[[int], object]) -> Iterator[None]:
         """Run episodes and write each to its file."""
@@ -181,7 +181,7 @@ def run_missing_episodes(
     alone = not isinstance(policy, nn.Module | None) or device_of(policy) != CPU
     with Progress("collecting", total * config.max_steps, "step", initial=before, show=progress) as bar:
         while wanted:
-            # Small parts: an interrupted collection loses the episodes of unfinished parts.
+            # Keep the parts small, because an interrupted collection loses the episodes of unfinished parts.
             limits: dict[str, Any] = {"workers": workers, "max_steps": config.max_steps, "largest": 64}
             with closing(spread(run, wanted, bar.update, alone=alone, **limits)) as written:
                 for _ in written:
@@ -275,7 +275,7 @@ def collect_demonstrations(
         next/success, next/done, next/terminated, next/truncated: (R, 1) bool.
 
     Args:
-        tasks: Meta-World tasks, as for :func:`resolve_tasks`, or another suite's; see docs/your-robot.md for your own.
+        tasks: Meta-World's, as for :func:`resolve_tasks`, or another suite's; docs/your-robot.md explains custom tasks.
         episodes_per_task: number of episodes of each task to keep.
         root: the dataset's folder; a new folder, or a folder that an earlier call created.
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks; None to derive the suite from the tasks' names.
@@ -295,8 +295,8 @@ def collect_demonstrations(
         max_steps: number of time steps per episode; None for the suite's default.
         num_envs: number of environments stepped together; None to choose the number automatically.
         workers: number of processes to split the episodes over, 1 for this process only; None for one per core if that
-            saves time (from about 300,000 time steps on two cores, 70,000 on 16). A function or a policy on a GPU then
-            stays in this process.
+            saves time (from about 300,000 time steps on two cores, 70,000 on 16). With None, a function or a policy
+            on a GPU stays in this process.
         progress: show a progress bar if the collection takes longer than a second.
 
     Raises:

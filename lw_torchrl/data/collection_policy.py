@@ -64,7 +64,7 @@ class Behaviour:
 
     @property
     def acts(self) -> Behaviour:
-        """The behaviour without the fingerprint of its plans, to compare behaviours of datasets with other tasks."""
+        """The behaviour without the plans' fingerprint, for comparing behaviours of datasets with different tasks."""
         return replace(self, fingerprint=None) if self.kind == "segments" else self
 
     def to_json(self) -> dict[str, Any]:
@@ -143,8 +143,8 @@ class SegmentActor(TensorDictModuleBase):
     """An actor that carries out a :class:`Behaviour` of kind "segments" in episodes of ``max_steps`` time steps.
 
     Reads ``observation`` (N, D) float32, ``task_id`` and ``episode`` (N,) int64, ``qaf`` (N, S) bool and ``_step``
-    (N,) bool, which marks the running rows; writes ``action`` (N, A) float32 in [-1, 1]. An episode begins when the
-    task or episode of a row differs from the previous call. ``plans`` must have a plan for each task.
+    (N,) bool, which marks the running rows; writes ``action`` (N, A) float32 in [-1, 1]. A new episode begins when
+    the task or episode of a row differs from the previous call. ``plans`` must have a plan for each task.
     """
 
     row_by_row = True  # without a network, the result does not depend on the number of rows

@@ -7,8 +7,8 @@ root/.lock            the lock file, held during collection
 
 The files in data/ have the format of ``TensorDict.memmap``, so ``TensorDict.load_memmap`` can read them. This module
 takes the shapes from :func:`columns_of` and unpickles nothing. The memory map is copy-on-write: writing to a column
-changes the column in this process only, never the file. Files are written without a memory map, because a full disk
-would kill a process that writes through a map, without an error.
+changes the column in this process only, never the file. Files are written without a memory map, because on a full
+disk, writing through a map would kill the process without an error.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class CollectConfig:
 
 @dataclass(frozen=True)
 class EpisodeInfo:
-    """One episode of a dataset, which was seeded with ``episode_seed(task, seed, episode)``.
+    """An episode of a dataset, seeded with ``episode_seed(task, seed, episode)``.
 
     ``start`` is the index of the first row, ``first_success`` the first successful time step (counted from 1, or None),
     and ``checksum`` the CRC-32 of the rows, column by column.

@@ -127,7 +127,7 @@ def load_demonstrations(
 ) -> TensorDict:
     """Load the rows of datasets written by :func:`collect_demonstrations`, for a :class:`torchrl.data.TensorStorage`.
 
-    The rows of a single folder stay memory-mapped as long as no rows are selected; changes to the rows never reach the
+    The rows of a single folder stay memory-mapped unless a selection is loaded; changes to the rows never reach the
     files. Several folders, or a selection of rows, are copied into memory.
 
     The R rows hold observation (R, 39) float32, action (R, 4) float32, task_id and episode (R,) int64, and the columns
@@ -142,7 +142,7 @@ def load_demonstrations(
         keep: a filter on these episodes, for example by success, return or behaviour; see :class:`EpisodeFilter`.
         label: the content of ``action``. "executed" is the executed action, with reward and next; it is required unless
             an expert collected the dataset. "expert" is the expert's action, in [-1, 1], and "unclipped" the expert's
-            action before clipping, up to 25; both load neither reward nor next, which belong to the executed action.
+            action before clipping, up to 25; both omit reward and next, which belong to the executed action.
         reward: the content of ``("next", "reward")`` with label="executed", a name in ``REWARDS``: "sparse" (success as
             0 or 1), "dense" (Meta-World's reward), "cost" or "dense_cost".
         after_success: drop rows more than N time steps after the first success of an episode.

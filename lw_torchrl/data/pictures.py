@@ -34,7 +34,7 @@ _TOGETHER = 8  # number of episodes that are re-run in parallel
 
 @dataclass(frozen=True)
 class Pictures:
-    """The cameras, image size and interval of a set of pictures, which also determine the file names."""
+    """The cameras, image size and interval of a set of pictures; these values determine the file names."""
 
     cameras: tuple[str, ...]
     height: int
@@ -155,7 +155,7 @@ def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
         for number, picture in enumerate(pictures):
             stream = io.BytesIO()
             Image.fromarray(picture).save(stream, "PNG")
-            # A ZipInfo without the current date makes equal pictures give equal files.
+            # Use a ZipInfo without the current date, so that equal pictures give equal files.
             archive.writestr(zipfile.ZipInfo(f"{number}.png"), stream.getvalue())
 
 

@@ -1,4 +1,4 @@
-"""LanguageWorldExperienceReplay: a TorchRL replay buffer over demonstration datasets, with a storage class."""
+"""LanguageWorldExperienceReplay: a TorchRL replay buffer over demonstration datasets, and its storage."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemons
 from lw_torchrl.transforms.qaf import QAFTransform, latches_of_rows
 
 _FILE = "buffer.safetensors"
-_OVER_TIME = {  # TorchRL's transforms that read several time steps of an episode; not all versions have all
+_OVER_TIME = {  # TorchRL's transforms that read several time steps of an episode; some versions lack some of them
     *("ActionChunkTransform", "BurnInTransform", "CatFrames", "NextStateReconstructor", "RandomCropTensorDict"),
     *("RewardSum", "TimeMaxPool"),
 }
@@ -223,8 +223,8 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
 
         Args:
             values: one value per row, (R, ...), in the order of ``replay[:]``; copied to the device of the rows.
-            of: another buffer from which the values were computed (for example with n steps), which must hold the same
-                rows in the same order.
+            of: the buffer from which the values were computed, if not this buffer (for example one with n steps). It
+                must hold the same rows in the same order.
 
         Raises:
             ValueError: samples already have the name, a value is not finite, or ``of`` holds other rows.
@@ -243,7 +243,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """The sorted names of the tasks of the selected episodes."""
+        """The sorted task names of the selected episodes."""
         return tuple(sorted({episode.task for episode in self.demonstrations.episodes}))
 
     @property

@@ -62,8 +62,8 @@ class GroupSampler(Sampler):
     """Base class for samplers that draw a fixed share of each batch from each group, without replacement in a group.
 
     A subclass defines the group of each row (:meth:`_label`) and the share of each group (:meth:`_weights`). A batch
-    holds the groups one after another. If the batch size cannot be divided exactly, the shares are rounded, and later
-    batches compensate, so that the totals stay within one row of the exact shares; with ``exact`` such a batch size is
+    holds the groups one after another. If the batch size cannot be divided exactly, the shares are rounded. Later
+    batches compensate, so that the totals stay within one row of the exact shares. With ``exact``, such a batch size is
     an error. A pass over a group may end within a batch; the next pass has a new order. For a storage with several
     dimensions (``ndim=2``), an index is a tuple of tensors.
 
@@ -71,7 +71,7 @@ class GroupSampler(Sampler):
     appears or disappears, or if a subclass cannot determine the group of single rows (:meth:`_keys`).
     """
 
-    ran_out = False  # whether the last batch ended an epoch: a pass over the group whose pass takes the most batches
+    ran_out = False  # whether the last batch ended an epoch, which is a pass over the group that takes the most batches
 
     @typed
     def __init__(self, exact: bool = False) -> None:
@@ -160,8 +160,8 @@ class GroupSampler(Sampler):
         order[:] = order[torch.randperm(len(order), generator=self._rng).numpy()]
 
     def _take(self, order: np.ndarray, cursor: int, count: int) -> tuple[np.ndarray, int]:
-        """Draw ``count`` rows of a group whose rows are ``order`` (n,), beginning new passes as needed; also return the
-        number of rows drawn since the last pass ended.
+        """Draw ``count`` rows of a group in the given ``order`` (n,) from ``cursor`` on; begin new passes as needed.
+        Also return the new cursor, the number of rows drawn since the last pass ended.
         """
         parts = []
         while count:
@@ -224,7 +224,7 @@ class GroupSampler(Sampler):
             self._check_restored(storage)
         if (self._written or self._covered(storage) != self._length) and not self._move_written(storage):
             self._group(storage)
-        # For this few numbers, NumPy takes a third of PyTorch's time.
+        # For so few numbers, NumPy takes a third of PyTorch's time.
         shares, group, place = (part.numpy() for part in self._layout(batch_size))
         order, size, cursor = self._order.numpy(), self._size.numpy(), self._cursor.numpy()
         starts = size.cumsum() - size
@@ -341,8 +341,8 @@ class CoLearningSampler(GroupSampler):
     """A sampler that draws part of every minibatch from a target task, and the rest in equal parts from the base tasks.
 
     The sampler works in any :class:`torchrl.data.ReplayBuffer`. Each task is drawn without replacement, in its own
-    passes. ``ran_out`` is True at the end of an epoch (the pass with the most batches). The sampler draws from the
-    replay buffer's generator; a restored state continues with the same batches.
+    passes. ``ran_out`` is True at the end of an epoch, a pass over the task that takes the most batches. The sampler
+    draws from the replay buffer's generator; a restored state continues with the same batches.
 
     If the rows have a column ``dataset``, which :func:`load_demonstrations` writes for several folders, target rows are
     drawn only from the last dataset that contains the target. A batch holds the target's rows, followed by the rows of
@@ -399,7 +399,7 @@ class CoLearningSampler(GroupSampler):
         if not is_target.any() or not is_base.any():
             tasks = ", ".join(MT50[i] if 0 <= i < len(MT50) else str(i) for i in task.unique().tolist())
             raise ValueError(f"target: the storage must have rows of {self.target!r} and of other tasks, got {tasks}")
-        with suppress(KeyError):  # the rows come from one dataset
+        with suppress(KeyError):  # rows of a single dataset lack this column
             dataset = column(storage, DATASET)
             is_target &= dataset == dataset[is_target].max()
         label = torch.where(is_target, 0, -1)

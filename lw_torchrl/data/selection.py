@@ -83,8 +83,8 @@ class EpisodeFilter:
 
 Label = Literal["expert", "unclipped", "executed"]
 EpisodeChoice = int | Mapping[str, int | Sequence[int]] | None
-"""A choice of episodes: None for all, a number N for the first N of each task, or a mapping whose keys are the tasks to
-use and whose values are an N or a list of episode indices.
+"""A choice of episodes: None for all, a number N for the first N of each task, or a mapping from each
+task to use to a number N or a list of episode indices.
 """
 
 
@@ -116,7 +116,7 @@ def choose_episodes(dataset: Demonstrations, choice: EpisodeChoice, argument: st
 
 
 def kept_rows(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, Tensor]:
-    """Return the indices of the rows up to ``after`` steps after each first success, and the number per episode."""
+    """Return the indices of rows up to ``after`` steps after each first success, and the number of rows per episode."""
     cuts = [e.length if after is None or e.first_success is None else e.first_success + after for e in episodes]
     starts = torch.tensor([e.start for e in episodes], dtype=torch.int64)
     lengths = torch.tensor([min(e.length, cut) for e, cut in zip(episodes, cuts, strict=True)], dtype=torch.int64)

@@ -40,8 +40,8 @@ class FinishedEpisode(NamedTuple):
 
 
 def num_rows(episodes: Mapping[str, Sequence[int]], most: int, num_envs: int | None = None) -> int:
-    """Return the number of environments to step together: ``num_envs``, or, if it is None, about ``most``, equally many
-    for each task. The number never exceeds the number of episodes that can run at once."""
+    """Return the number of environments to step together: ``num_envs``, or if that is None, about ``most``, divided
+    equally among the tasks. The number never exceeds the number of episodes that can run at once."""
     tasks, longest = len(episodes), max(map(len, episodes.values()))
     return min(tasks * longest, tasks * max(1, most // tasks) if num_envs is None else num_envs)
 
@@ -75,7 +75,7 @@ def run_episodes(
 
     Args:
         env: a LanguageWorldEnv, with or without transforms.
-        policy: a function of a TensorDict of all N rows, whose ``_step`` mask (N,) bool marks the active rows.
+        policy: a function of a TensorDict of all N rows, in which the mask ``_step`` (N,) bool marks the active rows.
         episodes: a mapping from task name to episode indices; an index listed twice is run twice.
         keys: the keys to record at each time step, such as ``("next", "success")``. The recorded ``action`` is the
             executed action.
@@ -83,9 +83,9 @@ def run_episodes(
             for no noise.
         noise_hold: number of time steps for which each noise value stays the same.
         after_success: end an episode N time steps after its first success; None to never end early.
-        clean_action: the key to which to write the action before noise is added.
-        place: the key to which to write the position (N,) int64 of each row's episode in its task's list, for the
-            policy.
+        clean_action: the key under which to store the action before noise is added; None to not store it.
+        place: the key under which the policy finds the position (N,) int64 of each row's episode in the list of its
+            task; None to omit it.
         on_progress: called after each step with the number of new time steps, including those skipped by an early end.
     """
     base = check_value("env", env.base_env if isinstance(env, TransformedEnv) else env, LanguageWorldEnv)

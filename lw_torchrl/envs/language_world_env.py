@@ -32,8 +32,8 @@ class LanguageWorldEnv(EnvBase):
     """A batch of N environments with any mixture of the 50 tasks, following the MT50-rand protocol: each reset draws a
     random initial state and goal, the goal is observed, and episodes are truncated after 500 time steps.
 
-    Row i has the task ``tasks[i % n]``. If R rows have the same task, the m-th reset of the r-th of these rows starts
-    episode m·R + r of the task; in worker w of W, episode (m·W + w)·R + r. An episode's initial state is that of
+    Row i has the task ``tasks[i % n]``. Counting from 0, the m-th reset of the r-th of R rows with the same task starts
+    episode m·R + r of the task; in worker w of W, episode (m·W + w)·R + r. An episode begins as in
     Meta-World after ``env.seed(episode_seed(task, seed, episode)); env.reset()``, independent of earlier episodes.
     ``env.reset(episode=7)`` starts episode 7 in every row; an int64 tensor (N,) selects one episode per row. Both count
     as a reset. With a SerialEnv or ParallelEnv, use ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores
@@ -76,8 +76,8 @@ class LanguageWorldEnv(EnvBase):
             threads never changes a result.
         reward: "sparse", the success as 0 or 1; or "dense", Meta-World's dense reward.
         max_steps: simulation steps until truncation; None for the suite's default (Meta-World: 500).
-        frame_skip: number of simulation steps per action. Their rewards are added, and a time step counts as successful
-            if any of them succeeds.
+        frame_skip: number of simulation steps per action. The rewards of these steps are added, and a time step counts
+            as successful if any of its simulation steps succeeds.
         terminate_on_success: end an episode at its first success, and set ``terminated``.
         strict: raise an error on a NaN action, instead of truncating the row with a warning.
         worker: (w, W), this environment's index among W environments; None for a single environment.

@@ -25,7 +25,7 @@ def check_image(path: AnyPath | None) -> None:
 
 
 def new_figure(width: float, height: float) -> Any:
-    """Return an empty ``matplotlib.figure.Figure`` (sizes in inches), which needs neither a window nor a backend."""
+    """Return an empty ``matplotlib.figure.Figure`` (sizes in inches) that needs neither a window nor a backend."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")

@@ -45,7 +45,7 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
         policy: the policy's file, or the name of a shipped policy.
         result: an evaluation of the policy; None for the stored result of a shipped policy. For any other policy, None
             gives a card without success rates.
-        repo: the Hub repository that the card loads the policy from, such as "me/my-policy"; "" to load from the file.
+        repo: the Hub repository in the card's loading example, such as "me/my-policy"; "" to load from the file.
 
     Returns:
         A ``huggingface_hub.ModelCard``; ``str(card)`` is Markdown, and ``card.save("README.md")`` writes a file.

@@ -1,4 +1,4 @@
-"""PlanUse: measure how often each plan step is chosen and its condition holds, and where failed episodes get stuck."""
+"""PlanUse: measure how often plan steps are chosen, how often conditions hold, and where failed episodes get stuck."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.suites.metaworld.experts import ExpertActor
 
 _AFTER = 20  # time steps after the first success that still count, as in training data
-_LATE = 50  # number of last states of a failed episode, in which the episode makes no progress
+_LATE = 50  # number of final states of a failed episode that show where the episode got stuck
 
 
 @dataclass
 class TaskUse:
     """Statistics of a task's plan over all episodes of the task, each cut 20 time steps after its first success.
 
-    If no skill weights were recorded, ``chosen`` is empty; ``stuck`` then counts true conditions.
+    If no skill weights were recorded, ``chosen`` is empty, and ``stuck`` counts true conditions instead.
     """
 
     states: int  # number of states

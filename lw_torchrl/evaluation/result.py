@@ -45,7 +45,7 @@ class EvaluationResult:
     config: dict[str, Any]  # tasks, episodes_per_task, seed, noise_scale, stop_at_success, max_steps
     episodes: tuple[EpisodeResult, ...]
     origin: dict[str, Any] = field(default_factory=dict, compare=False)  # provenance, recorded by save
-    failures: tuple[Failure, ...] | None = None  # why each failed episode failed; None without attribution
+    failures: tuple[Failure, ...] | None = None  # the cause of each failed episode; None without attribution
 
     def _by_task(self, value: Callable[[list[EpisodeResult]], float | None]) -> dict[str, float | None]:
         return {task: value([e for e in self.episodes if e.task == task]) for task in self.config["tasks"]}
@@ -152,7 +152,7 @@ class EvaluationResult:
         return "\n".join(lines)
 
     def failure_counts(self) -> dict[str, Counter[str]]:
-        """Return, for each task, the number of failures with each cause; raise ValueError if nothing was attributed."""
+        """Return, for each task, the number of failures with each cause; raise ValueError if ``failures`` is None."""
         if self.failures is None:
             raise ValueError("the result has no failures; run evaluate(..., attribute=True) to attribute failures")
         tasks = self.config["tasks"]

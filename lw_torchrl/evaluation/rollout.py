@@ -25,7 +25,7 @@ from lw_torchrl.modules.policy import draws, plans_of, transform_of
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
-ROWS = 256  # environments stepped together; more would hardly reduce the cost per row, and need more memory
+ROWS = 256  # number of environments stepped together; more need more memory and hardly reduce the time per row
 Acts = Callable[[TensorDictBase], TensorDictBase]
 
 
@@ -51,7 +51,7 @@ def rollout(
     progress: bool = False,
     workers: int | None = 1,
 ) -> None:
-    """Run each listed episode once, in eval mode and without exploration, and pass each one to ``on_episode``.
+    """Run each listed episode once, in eval mode and without exploration, and pass it to ``on_episode``.
 
     See :func:`evaluate` for the arguments that are not listed here, and for the seeding of episodes.
 
@@ -126,7 +126,7 @@ def _written(env: EnvBase) -> set[NestedKey]:
 
 
 def _checked(policy: Acts, env: EnvBase, keys: Iterable[NestedKey]) -> Acts:
-    """Wrap ``policy`` to check every action, and that policy or environment writes each key."""
+    """Wrap ``policy`` to check that actions are valid and that the policy or the environment writes each key."""
     by_env, size = _written(env), env.action_spec.shape[-1]
     others = [key for key in keys if key not in by_env]
 

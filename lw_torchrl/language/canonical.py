@@ -53,8 +53,8 @@ class CanonicalReport:
         """Return a JSON row for each step of ``written``, then one for each step that replaces the plan's steps.
 
         The keys are ``written`` (None for an added step); ``skill``, ``verb``, ``moved``, ``target`` and ``condition``
-        (None for a step that was left out); ``seen``, whether policies see the step; and, if the skill has words that
-        are ignored, such as "three times" or "without touching it", these words as ``ignored``.
+        (None for a step that was left out); ``seen`` (whether policies see the step); and ``ignored``, present only if
+        words of the skill are ignored, such as "three times" or "without touching it".
         """
 
         def note(step: PlanStep, seen: bool) -> dict[str, Any]:
@@ -76,10 +76,10 @@ class CanonicalReport:
 def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> ConditionalPlan:
     """Convert a free-form plan to a plan with a role for each step, and complete an underspecified plan.
 
-    Each step gets a verb, an object that moves, a target and a direction (:class:`StepRole`), which are inferred from
-    the step's words, its condition and the task's objects only. If the object that the hand touches has a named point,
+    Each step gets a verb, an object that moves, a target and a direction (:class:`StepRole`), inferred only from the
+    step's words, the step's condition and the task's objects. If the object that the hand touches has a named point,
     this point replaces the object. A plan whose conditions miss typical states, or that moves an object without
-    grasping it first, is completed: it gets the missing steps, and its own conditions are changed where they differ
+    grasping it first, is completed: missing steps are added, and its own conditions are changed where they differ
     from standard conditions. A plan without any motion is replaced by :func:`fallback_plan`. A plan that already has
     roles is not parsed again.
 
@@ -108,7 +108,7 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
         carry = step_of(slide.condition, replace(role_of(slide), verb="carry"))
         verbs = {role_of(step).verb for step in plan.steps}
         slid = "move" in verbs or verbs.isdisjoint(("carry", "push", "pull"))
-        other = (*other[:-1], carry, slide) if slid else (*other, carry)  # try first the motion that the plan lacks
+        other = (*other[:-1], carry, slide) if slid else (*other, carry)  # first try the motion that the plan lacks
     steps = [replace(step, reason="fallback", role=replace(role_of(step), fallback=True)) for step in other]
     return replace(plan, steps=(*plan.steps, *steps))
 
@@ -189,7 +189,7 @@ def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> t
     steps = []
     for number, (step, each) in enumerate(pairs):
         verb, manner, direction = each.verb, _manner(each), each.direction
-        # The purpose is the next step (or this one) that moves an object; otherwise the last such step before.
+        # The purpose is the next step (including this one) that moves an object, else the last such step before it.
         purpose = next((other for other in (*read[number:], *read[:number][::-1]) if other.verb not in BY_HAND), None)
         if verb in BY_HAND:
             verb, manner, direction = _approach(each, purpose if not grasping else None)
@@ -203,7 +203,7 @@ def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> t
 
 
 def _approach(each: ParsedStep, purpose: ParsedStep | None) -> tuple[Verb, Manner, Direction | None]:
-    """Return (verb, manner, direction) of a step that prepares for the step ``purpose``, or for a grasp if None."""
+    """Return (verb, manner, direction) of a step that prepares ``purpose``; ``purpose=None`` stands for a grasp."""
     verb = "descend" if each.verb == "beside" else each.verb
     if purpose is None:
         return verb, "grasp", None
@@ -274,7 +274,7 @@ def _past_obstacles(task: Task, steps: Sequence[PlanStep]) -> tuple[PlanStep, ..
 
 
 def _final_motion(steps: Sequence[PlanStep]) -> StepRole | None:
-    """Return the motion that ends at the goal, wherever it is in the plan; otherwise the last motion."""
+    """Return the motion that ends at the goal, at any place in the plan; otherwise the last motion."""
     moving = [step for step in steps if role_of(step).verb in ("carry", "move") and not is_free(step)]
     to_goal = [step for step in moving if role_of(step).target == GOAL]
     return motion_of([role_of(step) for step in to_goal or steps])

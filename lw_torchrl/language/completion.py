@@ -35,7 +35,7 @@ def is_complete(task: Task, steps: Sequence[PlanStep]) -> bool:
     roles = [role_of(step) for step in steps]
     verbs = [role.verb for role in roles]
     if any(role.verb == "pull" and "handle" not in role.target.split() for role in roles):
-        return False  # a handle can be hooked; any other object must be grasped before pulling
+        return False  # only a handle can be hooked; other objects must be grasped before pulling
     if {"carry", "move"}.isdisjoint(verbs):
         return motion_of(roles) is not None
     if "close" not in verbs or {"approach", "descend"}.isdisjoint(verbs):
@@ -48,7 +48,7 @@ def is_complete(task: Task, steps: Sequence[PlanStep]) -> bool:
 def completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple[PlanStep, ...]:
     """Build the steps that carry out ``motion`` on the object that the given steps touch.
 
-    Each given step replaces the standard step with the same action. Its condition is changed only where it is wrong.
+    Each given step replaces the standard step with the same action, and keeps its own condition where that is right.
     """
     if motion.manner == "reach":
         return tuple(steps)
@@ -74,8 +74,8 @@ def completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple[
             motion = replace(motion, moved=moved)
         if motion.verb == "move" and steps and any(map(is_obstacle, task.object_names)):
             motion = replace(motion, verb="carry")
-        # Fingers around a wide object do not close, but are no longer wide open. If a layout sets a threshold for
-        # "open", the threshold suits its objects.
+        # Fingers around a wide object do not close, but are no longer wide open. A layout's own threshold
+        # for "open" suits the objects of its suite.
         opened = gripper_is("open" if "open" in task.layout.thresholds else "wide open")
         held = Query((*near.clauses, *negated(opened).clauses))
         standard = (
@@ -100,13 +100,13 @@ def completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple[
 def _with_own(
     task: Task, steps: Sequence[PlanStep], standard: Sequence[PlanStep], motion: StepRole
 ) -> tuple[PlanStep, ...]:
-    """Replace each standard step by the plan's steps with the same action, and complete the conditions of these.
+    """Replace each standard step by the plan's steps with the same action, and complete their conditions.
 
-    If a plan's step is active at a hand position at which the standard step is not, the clauses of the standard
-    condition that are false there are added. If none of the plan's steps is active where the standard step is, the
-    condition of the last one is extended to be true there.
+    If a plan step is active at a hand position where the standard step is not, its condition gets the standard clauses
+    that are false there. If the standard step is active where no plan step is, the condition of the last plan step with
+    the same action is extended to that position.
     """
-    several = sum(role_of(step).verb in ("carry", "move") for step in standard) > 1  # already from the plan
+    several = sum(role_of(step).verb in ("carry", "move") for step in standard) > 1  # such steps come from the plan
 
     def is_same(role: StepRole, usual: StepRole) -> bool:
         if usual.verb in (*BY_HAND, "close"):
@@ -144,11 +144,11 @@ def _with_own(
 def _own_motions(task: Task, steps: Sequence[PlanStep], held: Query) -> list[PlanStep]:
     """Return the plan's steps that move a held object, if they include different motions; otherwise return [].
 
-    ``held`` replaces what their conditions state about the gripper. The last step is also active where no other is.
+    ``held`` replaces the clauses about the gripper. The last step is also active where none of the others is.
     """
     moving = [step for step in steps if role_of(step).verb in ("carry", "move") and not is_free(step)]
     distinct = {(role_of(step).moved, role_of(step).target, role_of(step).direction) for step in moving}
-    if len(distinct) < 2 or any(map(is_obstacle, task.object_names)):  # an object is lifted over an obstacle
+    if len(distinct) < 2 or any(map(is_obstacle, task.object_names)):  # an obstacle requires lifting the object
         return []
     guards = [_without_gripper(step.condition) for step in moving]
     guards[-1] = any_of([guards[-1], negate(any_of(guards))])
@@ -157,7 +157,7 @@ def _own_motions(task: Task, steps: Sequence[PlanStep], held: Query) -> list[Pla
 
 
 def _lifted(task: Task, steps: Sequence[PlanStep]) -> Sequence[PlanStep]:
-    """Replace "lift the wrench up" by a step that carries the wrench to the target of its next motion, if any."""
+    """Replace "lift the wrench up" with carrying the wrench to the target of its next motion, if there is one."""
     direct = list(steps)
     for number, step in enumerate(steps):
         role = role_of(step)

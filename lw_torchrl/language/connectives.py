@@ -89,7 +89,7 @@ def parse_words(
     """Parse a condition in English: "A or B", "not (A and B)", "neither A nor B", "A unless B", "once (A and B)".
 
     "and" binds tighter than "or", and "unless" binds loosest. The words before a parenthesis, "either", "both" or
-    "neither" belong to the first operand in it: "the gripper is (open or closed)".
+    "neither" belong to the first operand of that group: "the gripper is (open or closed)".
 
     Args:
         words: words and parentheses.

@@ -28,7 +28,7 @@ def role_of(step: PlanStep) -> StepRole:
 
 
 def touched_point(task: Task, roles: Sequence[StepRole]) -> str:
-    """Return the point that the hand touches: the target of the first hand motion, preferably not of an approach."""
+    """Return the point that the hand touches: the target of its first motion, ignoring approaches if possible."""
     hands = [role for role in roles if role.moved == GRIPPER != role.target and not is_goal(task, role.target)]
     hands = [role for role in hands if not is_obstacle(role.target)] or hands
     hand = min(hands, key=lambda role: role.verb == "approach", default=None)
@@ -70,7 +70,7 @@ _TYPICAL = {
     motion: [(offset, opening, lift, {*verbs.split()}) for hands, opening, lift, verbs in rows for offset in hands]
     for motion, rows in _MOTIONS.items()
 }
-# Gripper openings and hand positions relative to the touched point (metres), some at the relations' thresholds.
+# Hand positions (metres from the touched point) and gripper openings, some of them at the relations' thresholds.
 _PLANE = ((0.0, 0.0), (0.035, 0.01), (-0.01, -0.035), (-0.05, 0.02), (0.02, 0.07), (0.13, -0.1))
 _AROUND = _PLANE, (-0.01, 0.01, 0.034, 0.08), (1.0, 0.8, 0.3)
 
@@ -78,7 +78,7 @@ _AROUND = _PLANE, (-0.01, 0.01, 0.034, 0.08), (1.0, 0.8, 0.3)
 def _active(
     task: Task, point: str, motion: str, steps: Sequence[tuple[Query, Verb]]
 ) -> Iterator[tuple[set[Verb], set[str]]]:
-    """Yield the verbs of the active steps and the right verbs in each typical state."""
+    """Yield, for each typical state, the verbs of the active steps and the right verbs."""
     for offset, opening, lift, verbs in _TYPICAL[motion]:
         state = _state(task, point, offset, opening, lift)
         yield {verb for query, verb in steps if _holds(query, task, state)}, verbs
@@ -92,7 +92,7 @@ def true_around(task: Task, point: str, conditions: Sequence[Query]) -> Iterator
 
 
 def moves_before_grasp(task: Task, steps: Sequence[PlanStep]) -> bool:
-    """Return whether a step that moves an object is active in a typical state in which the hand holds no object."""
+    """Return whether, in some typical state without a grasped object, a step that moves an object is active."""
     point = touched_point(task, [role_of(step) for step in steps])
     moving: list[tuple[Query, Verb]] = [
         (step.condition, "move") for step in steps if role_of(step).verb in ("carry", "move")
@@ -125,7 +125,7 @@ def _position(position: Sequence[Coordinate], state: _Floats) -> _Floats:
 
 
 def _holds(query: Query, task: Task, state: _Floats) -> bool:
-    if query.is_conjunction:  # much faster, since it ends at the first clause that is false
+    if query.is_conjunction:  # much faster, since all() stops at the first false clause
         return all(_is_true(clause, task, state) for clause in query.clauses)
     return evaluate(query.expression, {leaf: _is_true(leaf, task, state) for leaf in leaves(query.expression)})
 

@@ -11,7 +11,7 @@ from lw_torchrl.language.formats.base import Note
 _BLOCK = r"[ \t]*```[^\n]*\n(?:(?![ \t]*```)[^\n]*\n)*[ \t]*```[ \t]*$"
 _IF = r"\b(?:when|whenever|if|once|unless)\b"
 _RULE = re.compile(rf"^[^\n]*{_IF}|^[ \t]*```\w+$", re.IGNORECASE | re.MULTILINE)
-_RULES = rf"(?:(?![^\n]*:[ \t]*$|[ \t]*(?:- )?\w+: )[^\n]*{_IF}[^\n]*(?:\n|\Z))+"  # but no keys of YAML
+_RULES = rf"(?:(?![^\n]*:[ \t]*$|[ \t]*(?:- )?\w+: )[^\n]*{_IF}[^\n]*(?:\n|\Z))+"  # except keys in YAML
 _DRAFT = re.compile(
     rf"(?:^[ \t]*>[^\n]*(?:\n|\Z))+"  # a quotation
     rf"|^[^\w\n\"']*(?:[❌✗✘]|(?:an? )?(?:wrong|incorrect|bad)(?: \w+)?:)[ \t]+(?=[^\n]*{_IF})[^\n]+"
@@ -28,7 +28,7 @@ _ABOVE = (
     r"(?:that|this|it|(?:(?:all|everything|what I wrote|the (?:plan|rules?|text|version)) ?)?(?:of )?(?:the )?above"
     r"|(?:the|my) (?:previous|first|old|earlier|initial|original)\b(?: \w+)?)"
 )
-_WITHDRAWS = re.compile(  # the text above: "Wait, that is wrong."
+_WITHDRAWS = re.compile(  # withdraws the text above: "Wait, that is wrong."
     r"(?:(?:wait|hm+|actually|no|oops|sorry|hold on|on second thoughts?|correction|my mistake|but|edit|update|note)"
     r"\b[\s,.!:;–—-]*)*"
     rf"(?:{_ABOVE}(?: is| was|'s) (?!not )(?:\w+ )?"
@@ -44,7 +44,7 @@ _NEWER = (
     r"(?:final|correct(?:ed)?|revised|updated|fixed|improved|amended|rewritten|refined|definitive|actual|real|better"
     r"|new)"
 )
-_ANNOUNCES = re.compile(  # the plan that replaces the text above: "Here is the corrected plan:"
+_ANNOUNCES = re.compile(  # announces the plan that replaces the text above: "Here is the corrected plan:"
     rf"(?!.*(?:{_IF}|\b(?:summary|overview|check|phase|stage|steps?)\b))(?:(?:[\w', ]{{0,40}} )?"
     rf"(?:{_NEWER}(?:(?: \w+)? {_PLAN}| (?:rules|code|list|response))|second (?:attempt|version|draft|try))\b"
     r"[^.:]{0,40}|final|correct(?:ed|ion)|revised|updated|(?:please )?(?:use|follow)\b[^.:]{0,30}\binstead)",
@@ -89,7 +89,7 @@ class _Line(NamedTuple):
 
 
 def without_drafts(text: str, notes: list[Note]) -> str:
-    """Remove what an answer strikes out, quotes, withdraws, or calls a draft, wrong or an example, and append notes.
+    """Remove text that an answer strikes out, quotes, withdraws, or labels as draft, wrong or example; append notes.
 
     Except for struck-out text, a part is removed only if a rule or another block of code remains.
     """
@@ -149,7 +149,7 @@ def _withdrawn(lines: list[_Line]) -> list[tuple[int, int]]:
 
 
 def _draft_sections(lines: list[_Line]) -> list[tuple[int, int]]:
-    """Return the spans below headings of drafts, each up to the next heading of the same level."""
+    """Return the spans of sections with drafts, each up to the next heading of the same or a higher level."""
     spans = list[tuple[int, int]]()
     for number, line in enumerate(lines):
         if not (line.level and _IS_DRAFT.search(line.text.replace("*", "").strip(_MARKUP))) or _replaces(line):
@@ -158,13 +158,13 @@ def _draft_sections(lines: list[_Line]) -> list[tuple[int, int]]:
         while end < len(lines) and not _ends(line, lines[end]):
             end += 1
             if line.level == 8 and lines[end - 1].text and not (end < len(lines) and lines[end].text):
-                break  # a label is for one paragraph
+                break  # a label applies to one paragraph
         spans.append((line.start, lines[end].start if end < len(lines) else lines[-1].start + len(lines[-1].text)))
     return spans
 
 
 def _ends(heading: _Line, line: _Line) -> bool:
-    """Return whether a line ends the section below a heading; below a label, any heading of a plan does."""
+    """Return whether a line ends the section of a heading; below a label or bold text, any heading of a plan does."""
     is_plan = heading.level > 6 and line.level > 0 and re.search(rf"\b(?:{_PLAN}|rules)\b", line.text, re.IGNORECASE)
     return 0 < line.level <= heading.level or bool(is_plan) or _replaces(line)
 

@@ -26,9 +26,9 @@ class _Node:
 class Expression(NamedTuple):
     """A boolean expression: a leaf, its negation, or a conjunction or disjunction of expressions.
 
-    :func:`all_of`, :func:`any_of` and :func:`negate` return expressions in normal form. Only leaves are negated. No
-    part of a conjunction is itself a conjunction, repeats or negates other parts, or is a disjunction that contains
-    another part; the same holds for disjunctions. Parts keep their order. Two expressions are equal if they have the
+    :func:`all_of`, :func:`any_of` and :func:`negate` return expressions in normal form. Only leaves are negated. A
+    part of a conjunction is never a conjunction, a copy or the negation of another part, or a disjunction that contains
+    another part. The same holds for disjunctions. Parts keep their order. Two expressions are equal if they have the
     same normal form.
 
     Equal parts are stored once, and the functions of this module visit each part once. Time and memory are therefore
@@ -63,7 +63,7 @@ class Expression(NamedTuple):
         return tuple(map(negate, parts)) if self.negated else parts
 
     def __str__(self) -> str:
-        """Write the expression with "and", "or", "not" and parentheses, which can take exponential time."""
+        """Write the expression with "and", "or", "not" and parentheses. This can take exponential time."""
         return write(self, lambda leaf, negated: f"not {leaf}" if negated else str(leaf))
 
     def __repr__(self) -> str:
@@ -140,7 +140,7 @@ def all_of(parts: Iterable[Any]) -> Expression:
                 del distinct[part]
     if len(distinct) == 1:
         return next(iter(distinct))
-    # The key holds the ids of the parts instead of the parts, so that only the node keeps the parts in memory.
+    # The key holds the parts' ids instead of the parts, so that only the node keeps the parts in memory.
     key = tuple((id(part.node), part.negated) for part in distinct)
     return Expression(_shared(key, None, tuple(distinct)), False)
 
@@ -168,7 +168,7 @@ class Once:
     def __str__(self) -> str:
         return f"once ({self.condition})"
 
-    @cached_property  # a latch may be mentioned by several others, which would be visited repeatedly
+    @cached_property  # avoids repeated visits to a latch that several others mention
     def literals(self) -> tuple[Expression, ...]:
         """The distinct leaves and negated leaves of the condition, without latches."""
         return literals(self.condition)
@@ -238,9 +238,9 @@ def map_leaves(expression: Expression, function: Callable[[Any], Any]) -> Expres
 
 
 def replace_leaves(expression: Expression, function: Callable[[Any], Any]) -> Expression:
-    """Replace each leaf as :func:`map_leaves` does; in a latch, replace the leaves of the condition."""
+    """Replace each leaf like :func:`map_leaves`, but in a latch replace the leaves of the condition."""
 
-    @cache  # a latch may be mentioned by several others
+    @cache  # several latches may mention the same latch
     def replaced(leaf: Any) -> Any:
         return once(map_leaves(leaf.condition, replaced)) if isinstance(leaf, Once) else function(leaf)
 
@@ -270,7 +270,7 @@ def leaves(expression: Expression) -> tuple[Any, ...]:
 def implied(expression: Expression) -> tuple[Expression, ...]:
     """Return leaves and negated leaves that are true wherever the expression is true.
 
-    Only those are returned that follow from the form of the expression, without a search over truth values.
+    The result has only leaves that follow from the form of the expression; truth values are not searched.
 
     Example:
         >>> implied(all_of(["a", any_of([all_of([negate("b"), "c"]), negate("b")])]))

@@ -1,8 +1,8 @@
 """Compile the expressions of many tasks to gates: index tensors that are evaluated for a whole batch at once.
 
-A gate is the conjunction of leaves, other gates, and the negations of either. A disjunction is a negated gate. A part
-that several expressions share becomes a single gate. The gates of a level depend only on lower levels and are evaluated
-together. The last level has one gate for each expression.
+A gate is a conjunction; its operands are leaves, other gates, or negations of these. A disjunction is a negated gate. A
+part that several expressions share becomes a single gate. The gates of a level depend only on lower levels and are
+evaluated together. The last level has one gate for each expression.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from torch import Tensor, nn
 from lw_torchrl.language.expressions import FALSE, Expression, fold, negate
 
 Truth = Literal["exact", "min-max", "product"]
-"""How gates combine values. With "exact", values are bool. Otherwise values are logits, and NOT flips the sign. AND is
-then the minimum of the logits ("min-max"), or the logit of the product of the probabilities ("product")."""
+"""How gates combine values. With "exact", values are bool. Otherwise values are logits: NOT flips the sign, and AND is
+the minimum of the logits ("min-max") or the logit of the product of the probabilities ("product")."""
 
 
 def inner_gates(expressions: Iterable[Expression]) -> dict[Expression, int]:
     """Return the conjunctions inside expressions, each with its level from 0, ordered by level.
 
-    The conjunction whose negation represents a disjunction is included. A whole expression is not.
+    A disjunction is included as the conjunction that it negates. A conjunction that is a whole expression is left out.
     """
     levels: dict[Expression, int] = {}
     for expression in expressions:
@@ -122,7 +122,7 @@ def evaluate_gates(values: Tensor, gates: Gates, truth: Truth) -> Tensor:
     Args:
         values: (B, A), bool for "exact", otherwise logits.
         gates: the gates of each row, with ``inputs`` and ``negated`` of length B.
-        truth: the kind of truth; gradients flow through both kinds of logits.
+        truth: how gates combine values; gradients flow through both kinds of logits.
     """
     inputs = negated = 0
     for number, (depth, width, count) in enumerate(gates.shapes):

@@ -53,10 +53,10 @@ class Layout:
     hand: Natural  # index of the gripper's x
     opening: Natural  # index of the gripper's opening, from 0 (closed) to 1 (open)
     things: tuple[Slot, ...]  # a task's objects in order; the numbers of an object that the task lacks are zero
-    goal: Natural  # index of the target's x; observations lack the target's position in the previous time step
+    goal: Natural  # index of the target's x; observations have no previous position of the target
     past: Natural | None = None  # offset from a number's index to its value in the previous time step
     action_size: Count = 4  # the length A of an action; each number is in [-1, 1]
-    displacement: Natural | None = 0  # index of the hand's displacement along x; None without a displacement
+    displacement: Natural | None = 0  # index of the hand's displacement along x; None if actions have no displacement
     reach: Positive = 0.01  # metres that the moving hand travels per time step at a displacement of 1
     gripper: Natural | None = 3  # index of the gripper's effort; None without a gripper
     closes: Literal[1, -1] = 1  # sign of the effort that closes the gripper
@@ -85,19 +85,19 @@ class Layout:
 
     @cached_property
     def present(self) -> tuple[slice, ...]:
-        """The slices for the current time step: hand, opening and objects, without the goal."""
+        """The slices of the hand, the opening and the objects in the current time step, without the goal."""
         opening = slice(self.opening, self.opening + 1)
         return (slice(self.hand, self.hand + 3), opening, *(part for thing in self.things for part in thing.numbers))
 
     @cached_property
     def positions(self) -> tuple[slice, ...]:
-        """The slices with the current positions: hand, objects, goal."""
+        """The slices of the current positions: hand, objects, goal."""
         starts = (self.hand, *(thing.position for thing in self.things), self.goal)
         return tuple(slice(start, start + 3) for start in starts)
 
     @cached_property
     def all_positions(self) -> tuple[slice, ...]:
-        """The slices with all positions, in the current and the previous time step."""
+        """The slices of all positions in the current and the previous time step."""
         return (*self.positions, *self._past(self.positions[:-1]))
 
     @cached_property
@@ -112,7 +112,7 @@ class Layout:
         return slice(0, 0) if self.gripper is None else slice(self.gripper, self.gripper + 1)
 
     def displaced(self, user: str) -> slice:
-        """Return the slice of an action with the hand's displacement; raise a ValueError for ``user`` without one."""
+        """Return the slice of the hand's displacement in actions; raise a ValueError for ``user`` if there is none."""
         if self.displacement is None:
             raise ValueError(f"{user}: actions must have a displacement of the hand, got layout {self.name!r}")
         return slice(self.displacement, self.displacement + 3)
@@ -124,7 +124,7 @@ class Layout:
         return slice(part.start + self.past, part.stop + self.past)
 
     def _past(self, parts: tuple[slice, ...]) -> tuple[slice, ...]:
-        """Return the slices of the same numbers in the previous time step; empty without a ``past``."""
+        """Return the slices of the same numbers in the previous time step; empty if ``past`` is None."""
         return () if self.past is None else tuple(map(self.a_step_before, parts))
 
     def to_json(self) -> dict[str, Any]:

@@ -18,12 +18,12 @@ def expand(program: Node, library: Mapping[str, str], read: Callable[[str], Node
     """Replace each action that calls a program of the library with that program.
 
     The name of a program may have placeholders: the action "grasp the mug" calls the program "grasp {object}". Inside
-    that program, the same action is the plain skill instead of another call.
+    that program, the same action does not call the program again but is the plain skill.
 
     Args:
         library: texts of programs by name, with the same placeholders.
         read: converts the text of a program to a tree.
-        calls: the calls that led to ``program``, the outermost first.
+        calls: the calls that led to ``program``, outermost first.
 
     Raises:
         ProgramError: a program calls itself through other programs.

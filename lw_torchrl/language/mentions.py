@@ -137,7 +137,7 @@ def _referents(phrase: list[str], task: Task) -> frozenset[str]:
 
 
 def _named(word: str, task: Task) -> frozenset[str]:
-    """Return the objects of a task that a noun can refer to by its name or by a synonym."""
+    """Return the objects of a task that a noun can refer to, as a word of an object's name or as a synonym."""
     names = _names(task)
     for form in (word, word.removesuffix("s")):
         if form in names:
@@ -146,7 +146,7 @@ def _named(word: str, task: Task) -> frozenset[str]:
 
 
 def _is_another(words: list[str], name: str, task: Task) -> bool:
-    """Return whether the words before a noun name another object than ``name``: "the drawer handle" of a window."""
+    """Return whether the words before a noun name an object other than ``name``: "the drawer handle" of a window."""
     own = _words(name)
     return any(
         word not in own

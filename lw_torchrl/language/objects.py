@@ -18,7 +18,7 @@ WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "wo
 
 GRIPPER = "robot's gripper"
 GOAL = "target location"
-"""The name of the goal in step roles; every observation has a goal, but tasks may call it something else."""
+"""The name of the goal in step roles. Every observation has a goal, but a task's own name for the goal may differ."""
 Coordinate = int | Finite
 """A coordinate: an int is an index into the observation, a float a fixed value in metres."""
 TypedPosition = tuple[tuple[bool, Coordinate], ...]
@@ -33,7 +33,7 @@ def typed_position(position: Sequence[Coordinate]) -> TypedPosition:
 
 
 def coordinate_indices(position: Sequence[Coordinate], constants: list[float], size: int) -> list[int]:
-    """Return the coordinates' indices in an observation (``size``) plus ``constants``; append missing constants."""
+    """Return indices into ``size`` observation entries followed by ``constants``; append any missing constants."""
     fixed = dict.fromkeys(c for c in position if not isinstance(c, int))
     constants += [c for c in fixed if c not in constants]
     return [c if isinstance(c, int) else size + constants.index(c) for c in position]
@@ -47,7 +47,7 @@ class NamedObject:
     name: str  # "drawer handle": lower-case words without an article
     position: tuple[Coordinate, Coordinate, Coordinate]  # x, y and z
     offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # metres from the object's position to this point
-    ours: bool = False  # whether this package adds the point, which the paper's object list lacks
+    ours: bool = False  # whether this package adds the point to the paper's object list
     opening: Natural | None = None  # index of the opening, from 0 (closed) to 1 (open); None if the object cannot open
 
     def __post_init__(self) -> None:
@@ -119,7 +119,7 @@ def read_objects(row: Mapping[str, Any], layout: Layout = METAWORLD) -> tuple[Na
 
 
 def write_objects(objects: Sequence[NamedObject]) -> dict[str, dict[str, Any]]:
-    """Convert objects and points to a row of tasks.toml, which may lose what such a row cannot express."""
+    """Convert objects and points to a row of tasks.toml; information that such a row cannot express is lost."""
     row: dict[str, dict[str, Any]] = {"objects": {}, "points": {}}
     published = {typed_position(named.position): named.name for named in reversed(objects) if not named.ours}
     for named in objects[1:]:

@@ -46,7 +46,7 @@ class DecodedStep:
     written_condition: str  # the condition as written
     written_skill: str  # the skill as written: "put gripper above mug" for ``robot.put("gripper above mug")``
     condition: Query | None  # the nearest query; None if no query is within the limit
-    condition_distance: float  # the largest distance of a clause
+    condition_distance: float  # the largest distance of the condition's clauses
     scripted: str | None  # the text of the nearest scripted skill; None if no skill is within the limit
     skill_distance: float
     written_goal: str = ""  # the state to reach, as written; "" without a goal
@@ -76,7 +76,7 @@ class DecodedPlan:
         return self.plan is not None and self.scripted is not None and len(self.scripted.steps) == len(self.plan.steps)
 
 
-_CODE_SPAN = re.compile(r"(?<![`\w])`([^`\n]* [^`\n]*)`(?![`\w])")  # not of one word, such as a task's name
+_CODE_SPAN = re.compile(r"(?<![`\w])`([^`\n]* [^`\n]*)`(?![`\w])")  # of several words, unlike a task's name
 _PUBLISHED = re.compile(r'^- When [^“”„«]*, (?:the robot should|move the robot)|check\("', re.MULTILINE)
 # Typographic characters that models write instead of ASCII characters; an empty string deletes the character.
 _TYPOGRAPHY = str.maketrans(
@@ -97,16 +97,16 @@ def decode_plan(
 
     Only clauses for ``task`` are used: those under a function or heading with the task's name, and those before the
     first name, because the answer may continue the prompt. If the text has several versions of the plan, the longest is
-    used (of equally long ones, the first). Reasoning between tags such as ``<think>`` and ``</think>`` is ignored. The
-    text may have another format than the requested one.
+    used (the first of equally long ones). Reasoning between tags such as ``<think>`` and ``</think>`` is ignored. The
+    text may be in a format other than the requested one.
 
-    A plan may be a program: Python with ``elif``, ``else``, ``or``, ``while``, early ``return`` and helper functions;
+    The plan may be a program: Python with ``elif``, ``else``, ``or``, ``while``, early ``return`` and helper functions;
     a behaviour tree, rules or a state machine in JSON or YAML; or prose with "otherwise" and "repeat until". Each
     action becomes a step, guarded by all conditions on the path to it. Parts that a plan cannot express are left out,
     with a note.
 
-    Each clause of a condition outside the query language is replaced by the nearest query by edit distance; if no query
-    is near enough, the step is dropped. ``plan`` keeps the skills as written; ``scripted`` has the nearest scripted
+    Each condition clause outside the query language is replaced with the query nearest in edit distance; if no query is
+    near enough, the step is dropped. ``plan`` keeps the skills as written; ``scripted`` has the nearest scripted
     skills instead.
 
     Args:
@@ -133,7 +133,7 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
     owner, notes = mapper.task, list[Note]()
     text = without_drafts(without_thoughts(text, notes), notes)
     if "\n" not in text.strip():
-        text = text.replace("\\n", "\n")  # two characters that stand for a new line
+        text = text.replace("\\n", "\n")  # a backslash and an n instead of a line break
     text = _CODE_SPAN.sub(r"\1", text if _PUBLISHED.search(text) else _plain_characters(text))
     if len(text) > _LONGEST:
         notes.append(
@@ -173,7 +173,7 @@ def decode_as(text: str, read: Callable[[str], Reading] | None, mapper: StepMapp
 
 
 def _outside_code(text: str) -> str:
-    """Replace the fenced blocks of a text, or a text without fences, with blank lines."""
+    """Replace the fenced blocks of a text with blank lines; return "" for a text without fences."""
     blocks = _FENCED.sub(lambda block: "\n" * block[0].count("\n"), text)
     return blocks if blocks != text else ""
 
@@ -217,7 +217,7 @@ def decode_program(program: str | Node, task: Task, library: Mapping[str, str] |
 
 
 def _unquoted(text: str) -> str:
-    """Remove the quotation marks around a text, but not those of words in it."""
+    """Remove the quotation marks around a text, but not those around words inside it."""
     return text.strip('"') if text.startswith('"') else text
 
 
@@ -296,7 +296,7 @@ def _mapped_guard(
     A text is unknown if no query is near enough. It then counts as never true, so that its ``else`` branch is kept.
     """
     distances, unknown = [0.0], list[str]()
-    is_text = guard.kind == "leaf" and not guard.negated  # if it is unknown, the step is left out by name
+    is_text = guard.kind == "leaf" and not guard.negated  # if unknown, the note on the dropped step names it
 
     def query(leaf: Any) -> Expression:
         if isinstance(leaf, Done):

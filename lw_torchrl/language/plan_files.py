@@ -60,7 +60,7 @@ def check_plan(
     """Parse a plan like :func:`parse_plan`, but return (plan, []) or (None, all errors in line order)."""
     if len(text) > PLAN_LIMIT:
         return None, [f"{source}: a plan's text must have at most {PLAN_LIMIT} characters, got {len(text)}"]
-    name, condition, is_open = "", None, False  # is_open: whether the last condition, valid or not, has no skill yet
+    name, condition, is_open = "", None, False  # is_open: the last condition, valid or not, has no skill yet
     faults, steps, reason = list[str](), list[PlanStep](), list[str]()
     for number, line in enumerate(map(str.strip, text.splitlines()), 1):
         where, fault = f"{source}, line {number}", ""
@@ -117,8 +117,8 @@ def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks
     """Load the shipped plans, or plans from files.
 
     A .json file maps task names to lists of (condition, skill) pairs, at the top level or under the key "plans". A
-    condition outside the query language is replaced by the nearest query (:func:`nearest_query`) if each clause is
-    within a distance of 0.4; the step's ``reason`` then quotes the original condition.
+    condition outside the query language is replaced by the nearest query (:func:`nearest_query`) if the distance of
+    each clause is at most 0.4. The step's ``reason`` then quotes the original condition.
 
     Args:
         source: "MT10" or "MT50" for the shipped plans; or the path of a .plan or .json file, or of a folder of .plan
@@ -190,7 +190,7 @@ def _rows(text: str) -> Any:
 
 
 def check_pairs(text: str, source: str, tasks: Tasks = TASKS) -> tuple[list[ConditionalPlan], list[str]]:
-    """Parse JSON of (condition, skill) pairs, and return the plans and all errors; each must be near a query."""
+    """Parse JSON of (condition, skill) pairs; return the plans and all errors (such as conditions not near a query)."""
     try:
         rows = check_value("plans", _rows(text), dict)
     except ValueError as error:
@@ -227,7 +227,7 @@ def _step_of(pair: Any, task: Task) -> PlanStep:
 
 @typed
 def save_plans(plans: AnyPlans, folder: AnyPath) -> list[Path]:
-    """Write each plan atomically to ``folder``/<task>.plan, with "__" for a slash; return the paths."""
+    """Write each plan atomically to ``folder``/<task>.plan, with "__" for a slash in the name; return the paths."""
     texts = {Path(folder) / f"{task.replace('/', '__')}.plan": str(plan) for task, plan in as_plans(plans).items()}
     Path(folder).mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():

@@ -80,7 +80,7 @@ class PlanStep:
 @typed_fields
 @dataclass(frozen=True)
 class ConditionalPlan:
-    """A plan for one task: 1 to 1,000 steps, as in the paper's section 'Conditional Plan Generation'.
+    """A plan of 1 to 1,000 steps for one task; see the paper's section 'Conditional Plan Generation'.
 
     Conditions and skills are stored in canonical spelling (``str(query)``, "the" before nouns), so that parsing the
     plan's text returns an equal plan. Two plans are equal if their conditions, skills and goals are equal.
@@ -96,7 +96,7 @@ class ConditionalPlan:
 
     task: str
     steps: tuple[PlanStep, ...]
-    # The task whose objects the conditions name; None for the shipped task with the name ``task``.
+    # The task whose objects the conditions name; None for the shipped task called ``task``.
     definition: Task = field(default=None, compare=False, repr=False)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -136,12 +136,12 @@ class ConditionalPlan:
         """Build a plan from a program with control flow; the text is parsed, never executed.
 
         Each action becomes a step, guarded by all conditions on the path to it, as in :func:`~lw_torchrl.decode_plan`.
-        That function also reports what was left out.
+        That function also reports which parts of the text were left out.
 
         Args:
             program: Python, JSON, YAML or prose; or a tree of :mod:`lw_torchrl.language.programs`.
-            library: programs that ``program`` may call by name, such as {"grasp {object}": text}, for example
-                :data:`lw_torchrl.language.library.LIBRARY`; None for none.
+            library: programs that ``program`` may call, by name: {"grasp {object}": text}, or the shipped
+                :data:`lw_torchrl.language.library.LIBRARY`; None for no library.
 
         Raises:
             PlanError: no action for the task can be parsed, the program nests too deeply, or a program of the library
@@ -187,7 +187,7 @@ class ConditionalPlan:
         return function_head(self.definition) + "".join(f"{line}\n" for line in lines)
 
     def to_json(self) -> dict[str, Any]:
-        """Convert the plan to JSON: its text, its task if not shipped, and its roles, if any."""
+        """Convert the plan to JSON: its text, its roles (if any), and its task (unless shipped)."""
         row: dict[str, Any] = {"plan": str(self)}
         if self.definition != TASKS.get(self.task):
             row["task"] = self.definition.to_json()
@@ -201,7 +201,7 @@ class ConditionalPlan:
         from lw_torchrl.language.plan_files import parse_plan  # here, because plan_files imports this module
 
         where = f"plan of {shown(name)}"
-        keys = ("plan", "task", "roles", "confidence")  # earlier versions wrote a confidence, which predicted nothing
+        keys = ("plan", "task", "roles", "confidence")  # earlier versions wrote a confidence; it is ignored
         if not isinstance(row, dict) or not isinstance(row.get("plan"), str) or set(row) - {*keys}:
             raise PlanError(f'{where} must be an object {{"plan": text, "task": object}}, got {shown(row)}')
         try:
@@ -312,7 +312,7 @@ class Plans(Mapping[str, ConditionalPlan]):
         return cls([ConditionalPlan.from_json(name, plan) for name, plan in row.items()])
 
     def differences(self, other: Plans) -> list[str]:
-        """Return the tasks that have a plan in both collections, but with different fingerprints."""
+        """Return the tasks whose plans in the two collections have different fingerprints."""
         theirs = other.numbers
         return [task for task, number in self.numbers.items() if number != theirs.get(task, number)]
 

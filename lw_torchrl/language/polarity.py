@@ -18,7 +18,7 @@ _REWRITINGS = [
 ]
 _NOT = frozenset(_WORDS["not"])
 _APOSTROPHE = re.compile("[’‘ʼ´`ʹ′＇]")
-_HUMP = re.compile("(?<=[a-z])(?=[A-Z][a-z])")  # the place of a space in "isNotNear"
+_HUMP = re.compile("(?<=[a-z])(?=[A-Z][a-z])")  # where "isNotNear" lacks a space
 _UNREAD = re.compile(rf"(?:{'|'.join(_WORDS['unread'])})", re.IGNORECASE)
 _POLES: dict[str, tuple[int, int]] = {  # word -> (index of its pair of opposites, 0 or 1 for its side)
     word: (number, side) for number, pair in enumerate(_WORDS["opposites"]) for side in (0, 1) for word in pair[side]
@@ -94,12 +94,12 @@ def affirmed(text: str) -> Affirmed:
 
 
 def poles(words: Iterable[str]) -> frozenset[tuple[int, int]]:
-    """Return the pair of opposites, such as "above" and "below", and the side of each word that belongs to one."""
+    """Return (pair of opposites, side) for each word that belongs to a pair, such as "above" and "below"."""
     return frozenset(_POLES[word] for word in words if word in _POLES)
 
 
 def agree(written: Iterable[tuple[int, int]], read: Iterable[tuple[int, int]]) -> bool:
-    """Return whether the parsed words contain no opposite of a written word, except opposites that are also written."""
+    """Return False if a parsed word is not written but its opposite is, and True otherwise."""
     return not any((pair, 1 - side) in written and (pair, side) not in written for pair, side in read)
 
 
@@ -136,7 +136,7 @@ def instruction(skill: str) -> Instruction:
 
 
 def forbids(text: str, is_whole: bool = True) -> bool:
-    """Return whether a clause consists of a prohibition; unless ``is_whole``, whether a text contains one.
+    """Return whether a whole clause is a prohibition; with ``is_whole=False``, return whether a text contains one.
 
     Example:
         >>> forbids("the robot shouldn't close the gripper"), forbids("push the mug, but do not lift it")
@@ -147,7 +147,7 @@ def forbids(text: str, is_whole: bool = True) -> bool:
 
 
 def command_form(word: str) -> str | None:
-    """Return the verb of motion of which a word is the form in "-ing"; None for any other word.
+    """Return the base form of a verb of motion that ends in "-ing"; None for any other word.
 
     Example:
         >>> command_form("gripping"), command_form("moving"), command_form("ring")

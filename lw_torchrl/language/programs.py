@@ -37,7 +37,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Branch:
-    """A choice between two programs; it fails if the condition is false and there is no second program."""
+    """A choice between two programs. The branch fails if its condition is false and it has no second program."""
 
     condition: Expression
     then: Node
@@ -57,7 +57,7 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Block:
-    """A block of code. Its branches and loops run concurrently; an action waits until all parts above it are done."""
+    """A block of code. Branches and loops run concurrently; each action waits until all parts above are done."""
 
     parts: tuple[Node, ...] = ()
 
@@ -74,7 +74,7 @@ class Selector:
 
 @dataclass(frozen=True)
 class Loop:
-    """A loop that runs a program while a condition is true; the parts after the loop wait until it is false."""
+    """A loop that runs a program while a condition is true. Later parts wait until the condition is false."""
 
     condition: Expression
     body: Node
@@ -96,7 +96,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Done:
-    """A leaf of a condition, which is true once an action has taken effect."""
+    """A leaf of a condition. The leaf is true once an action has taken effect."""
 
     text: str  # the action's text
 
@@ -108,7 +108,7 @@ Node: TypeAlias = Action | Check | Branch | Sequence | Block | Selector | Loop |
 class _Flow:
     """The conditions under which control leaves a program, given that the program's guard is true."""
 
-    falls: Expression = TRUE  # control reaches the end, if actions took no time
+    falls: Expression = TRUE  # control would reach the end if actions took no time
     settles: Expression = TRUE  # control reaches the end, and all actions are done
     fails: Expression = FALSE
     jumps: dict[str, Expression] = field(default_factory=dict)  # label to the condition of a jump to it
@@ -136,8 +136,8 @@ def compile_program(
     Args:
         effect: returns the condition that an action makes true ("the gripper is open"), or None if there is none.
         known: returns whether a condition can be evaluated; a loop with an unknown condition always runs.
-        is_done: returns whether a guard implies an effect. An action whose guard implies its effect counts as an action
-            without an effect.
+        is_done: returns whether a guard implies an effect. An action whose guard implies its effect is treated
+            as an action without an effect.
 
     Raises:
         ProgramError: the program nests more than 60 levels deep, or a condition joins more than 1,000 parts.
@@ -191,7 +191,7 @@ def is_condition(node: Node) -> bool:
 
 
 def tidy(guard: Expression) -> Expression:
-    """Drop the alternatives that the rest of a conjunction excludes: "a and (not a or b)" becomes "a and b".
+    """Drop alternatives that contradict the rest of a conjunction: "a and (not a or b)" becomes "a and b".
 
     Example:
         >>> print(tidy(all_of(["a", any_of([negate("a"), "b"])])))
@@ -222,7 +222,7 @@ class _Compiler:
     def run(self, node: Node, here: Expression, followed: bool, depth: int) -> _Flow:
         """Append the guarded actions of a program with the guard ``here``.
 
-        If a program is ``followed`` by another one, its last action stops as soon as it has had its effect.
+        If the program is ``followed`` by another one, the last action stops as soon as its effect is reached.
         """
         if depth > MOST_DEPTH:
             raise ProgramError(f"a program must nest at most {MOST_DEPTH} levels deep; split it into consecutive steps")

@@ -70,7 +70,7 @@ class Query:
     given, including repetitions.
 
     Args:
-        expression: an expression over clauses (:mod:`lw_torchrl.language.expressions`); or a tuple of clauses that must
+        expression: an expression over clauses (:mod:`lw_torchrl.language.expressions`), or a tuple of clauses that must
             all be true.
 
     Example:
@@ -235,12 +235,12 @@ def supported_queries(task: str | Task, published_only: bool = False) -> tuple[s
 
 
 def _cut(text: str, most: int = 80) -> str:
-    """Shorten a text to at most ``most`` characters by cutting out its middle."""
+    """Shorten a text to at most ``most`` characters by removing its middle."""
     return text if len(text) <= most else f"{text[: most - 25]} ... {text[-20:]}"
 
 
 class _ClauseParser:
-    """A left-to-right parser for one clause, whose errors point at a word."""
+    """A left-to-right parser for one clause. Its errors point at a word of the text."""
 
     def __init__(self, words: Sequence[str], task: Task, text: str, explain: bool) -> None:
         self.words, self.task, self.text, self.explain, self.at = words, task, text, explain, 0
@@ -260,7 +260,7 @@ class _ClauseParser:
         )
 
     def take(self, phrase: str) -> bool:
-        """Consume a phrase if the phrase comes next, and return whether it did."""
+        """Consume a phrase if it comes next in the text; return whether it did."""
         words = phrase.split()
         if list(self.words[self.at : self.at + len(words)]) != words:
             return False

@@ -14,7 +14,7 @@ def answer(
 ) -> bool:  # fmt: skip
     """Write each row's query results to ``truth`` (B, S) bool, with QueryProgram's operations in the same order.
 
-    ``observation`` is (B, D) float32 or float64, in metres; ``task_id`` is (B,) int64; ``latches`` is (B, L) bool;
+    ``observation`` is (B, D) float32 or float64, in metres; ``task_id`` is (B,) int64; ``latches`` is (B, L) bool.
     ``ids`` to ``constants`` are the fields of :class:`QueryFacts`. Return False if a task has no queries or a number
     is NaN or infinite.
     """

@@ -88,7 +88,7 @@ class QueryProgram(nn.Module):
         Args:
             observation: (..., D) float, in the tasks' layout (39 numbers in metres for Meta-World).
             task_id: (...) int64, ids of tasks with queries.
-            latches: (..., L) bool, the latches of the previous or of the same step; only required if L > 0.
+            latches: (..., L) bool, the latches of the previous or the current step; only required if L > 0.
 
         Returns:
             (..., S) bool on the observation's device, in the order of the task's list of queries; padding is false.
@@ -163,8 +163,8 @@ class QueryProgram(nn.Module):
         negation changes the sign.
 
         With "min-max", a conjunction has the smallest margin of its operands, and a disjunction the largest. The logit
-        is positive if the query is true, otherwise negative, and never zero. Its gradient is that of the comparison
-        that decides.
+        is positive if the query is true, otherwise negative, and never zero. Its gradient is the gradient of the
+        comparison that determines it.
 
         With "product", the operands are treated as independent statements, whose probabilities are the sigmoids of
         their logits. Every operand then has a gradient, but a true query may have a negative logit near a threshold.
@@ -212,7 +212,7 @@ class QueryProgram(nn.Module):
     def _answer(
         self, kernel: Callable[..., bool], observation: Tensor, task_id: Tensor, latches: Tensor | None = None
     ) -> Tensor:
-        """Answer with few PyTorch operations, which are slow here, as physics has just evicted the CPU's caches."""
+        """Answer with few PyTorch operations: they are slow here, as physics has just evicted the CPU's caches."""
         states = observation.numpy(force=observation.requires_grad).reshape(-1, self.layout.size)
         ids = task_id.numpy().reshape(-1)
         truth = np.empty((len(ids), self._columns), dtype=bool)
@@ -222,11 +222,11 @@ class QueryProgram(nn.Module):
         batch = np.ascontiguousarray(states), np.ascontiguousarray(ids, dtype=np.int64), before
         if not kernel(*batch, *self._facts[observation.dtype], truth):
             check_finite("observation", observation)
-            self._tables.select(task_id.reshape(-1), observation)  # this call raises if the one above did not
+            self._tables.select(task_id.reshape(-1), observation)  # raises for a task without queries
         return torch.from_numpy(truth.reshape(*task_id.shape, self._columns))
 
     def _combine(self, atoms: Tensor, tables: QueryTables, truth: Truth) -> Tensor:
-        """Return the truth or the logits (B, S) of queries from those of all atoms (B, A)."""
+        """Combine the truth or the logits of all atoms (B, A) into those of the queries (B, S)."""
         return evaluate_gates(atoms, Gates(tables.inputs, tables.negated, self._shapes), truth)
 
     def _values(self, observation: Tensor, tables: QueryTables, floor: float = 0.0) -> Tensor:

@@ -23,8 +23,7 @@ from lw_torchrl.language.tasks import MT50, Task, one_layout, task_id
 class Atom(NamedTuple):
     """A comparison of two positions in the form "value < threshold".
 
-    For the operators ">" and "<=", the positions are swapped, which negates the value; the threshold is also
-    negated.
+    For the operators ">" and "<=", the value and the threshold are negated. Swapping the positions negates the value.
     """
 
     first: TypedPosition
@@ -33,7 +32,7 @@ class Atom(NamedTuple):
     part: Comparison
 
     def coordinates(self, side: int, constants: list[float], size: int) -> list[int]:
-        """Return the index of each coordinate of position ``side`` (0 or 1); an unused axis has the index of 0.0."""
+        """Return each coordinate's index for position ``side`` (0 or 1), or the index of 0.0 for unused axes."""
         position = (self.first, self.second)[side if self.part.sense == "<" else 1 - side]
         used = [c if axis in self.part.axes else 0.0 for axis, (_, c) in zip("xyz", position, strict=True)]
         return coordinate_indices(used, constants, size)
@@ -47,12 +46,12 @@ class Atom(NamedTuple):
 
     @property
     def threshold(self) -> float:
-        """The threshold in metres; the atom is true if its value is below it (at or above it if :attr:`flipped`)."""
+        """The threshold (m): the atom is true for smaller values or, if :attr:`flipped`, for equal or larger ones."""
         return self.part.threshold if self.part.sense == "<" else -self.part.threshold
 
     @property
     def far(self) -> bool:
-        """Whether the value is a length that must be negated, since swapping the positions does not negate a length."""
+        """Whether to negate the value explicitly: swapping the positions negates a coordinate, but not a length."""
         return self.part.length and self.part.sense != "<"
 
     @property
@@ -126,10 +125,10 @@ class QueryTables(NamedTuple):
     The first dimension indexes the tasks (T) or, in tables selected for a batch, the rows of the batch (B).
     """
 
-    first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; an unused axis has the index of 0.0
+    first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; the index of 0.0 for unused axes
     second: Tensor  # (T, 3*A) int64, the same for the second position
     shift: Tensor  # (T, 3, A) float64, metres added to the difference
-    length: Tensor  # (T, A) bool, compare the length of the difference; otherwise one coordinate
+    length: Tensor  # (T, A) bool, compare the length of the difference instead of one coordinate
     far: Tensor  # (T, A) bool, negate the length
     threshold: Tensor  # (T, A) float64, metres; an atom is true where its value is below
     flipped: Tensor  # (T, A) bool, negate the atom
@@ -140,7 +139,7 @@ class QueryTables(NamedTuple):
 
 
 def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> tuple[QueryTables, Shapes]:
-    """Compile the queries of tasks to tables, one row per task in the order of the mapping, and the shapes of gates."""
+    """Compile queries; return tables with one row per task, in the mapping's order, and the shapes of the gates."""
     expressions, latches = _columns(queries)
     atoms_of = [
         {leaf: clause_atoms(leaf, task) for leaf in chain(*map(leaves, listed)) if not isinstance(leaf, Before)}
@@ -202,7 +201,7 @@ class QueryFacts(NamedTuple):
     metres: NDArray[np.floating[Any]]  # (F, 5): the shift along x, y and z, the length's sign, the threshold
     bit: Bits  # (F,), the bit number of each fact
     flipped: Bits  # (T,), the bits to negate
-    gates: Bits  # (D, 3): care, want, and the bit to set if the gate is true; a gate depends on bits of earlier ones
+    gates: Bits  # (D, 3): care, want, and the bit to set if the gate is true; it depends only on earlier bits
     care: Bits  # (T, S), the bits that each query depends on
     want: Bits  # (T, S), the required values of these bits
     constants: NDArray[np.floating[Any]]  # (C,), indexed as if they followed the observation
@@ -287,7 +286,7 @@ def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
     care, want = np.moveaxis(np.array(padded, np.uint64), 2, 0)
     tables = {"ends": ends, "places": places, "bit": bits, "flipped": flipped, "care": care, "want": want}
     facts = {name: np.array(table, np.uint64, order="C") for name, table in tables.items()}
-    facts["places"] = facts["places"].reshape(-1, 6)  # also if there are no atoms
+    facts["places"] = facts["places"].reshape(-1, 6)  # needed if there are no atoms
     facts["gates"] = np.array(gates, np.uint64).reshape(-1, 3)
     lengths_of = np.array(metres, np.float64).reshape(-1, 5)
     return QueryFacts(ids=np.array(ids), row_of=row_of, metres=lengths_of, constants=np.array(constants), **facts)

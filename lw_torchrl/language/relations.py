@@ -1,6 +1,6 @@
 """Load spatial relations and object states from data/relations.toml.
 
-Each is a set of comparisons on d = first position - second position, in metres.
+Each relation or state is a set of comparisons on d = first position - second position, in metres.
 """
 
 import re
@@ -87,7 +87,7 @@ PREDICATES.maps = [STATES, _OF_POSITION, RELATIONS]  # type: ignore[list-item]
 
 
 def comparisons(predicate: str, layout: Layout) -> tuple[Comparison, ...]:
-    """Return the comparisons of a predicate, with the threshold that ``layout`` sets, if any."""
+    """Return the comparisons of a predicate, with the threshold of ``layout`` if it sets one for the predicate."""
     parts = PREDICATES[predicate]
     if (threshold := layout.thresholds.get(predicate)) is None:
         return parts

@@ -90,7 +90,7 @@ def _names(task: Task) -> dict[str, str]:
 
 @lru_cache(maxsize=1)
 def vocabulary() -> frozenset[str]:
-    """Return the words of the tables and of the 50 tasks, which are never corrected as misspelled."""
+    """Return the words of the tables and of the 50 tasks. These words are never corrected as misspelled."""
     texts = [text for task in TASKS.values() for text in (task.description, *task.object_names)]
     return frozenset(re.findall(r"[a-z]+", f"{WORDS} {' '.join(texts)}".lower()))
 
@@ -114,7 +114,7 @@ def respell(text: str, task: Task) -> str:
             most = 2 if len(name) >= 7 and name not in _WORDS["place"] else 1
             if name[0] != word[0] or OSA.distance(word, name, score_cutoff=most) > most or f"{word}s" == name:
                 continue
-            # A wrong letter may turn a short word into a different word ("hard", "hand"); swapped letters do not.
+            # In a short word, a wrong letter may give a different word ("hard", "hand"), but swapped letters do not.
             if (
                 len(name) >= 6
                 or (name in objects and len(name) > 3)
@@ -133,7 +133,7 @@ def respell(text: str, task: Task) -> str:
 
 @lru_cache(maxsize=256)
 def _used_words(task: Task) -> frozenset[str]:
-    """Return the words that the parser of steps uses, in a task."""
+    """Return the words that the parser of steps uses for a task."""
     names = [name for other in (task, *TASKS.values()) for name in other.object_names]
     tables = str((_WORDS, WORDS["negation"]["affirms"], WORDS["negation"]["manner"]))
     text = " ".join((re.sub(r"\\+[a-z]", " ", tables), task.description, *names))
@@ -142,7 +142,7 @@ def _used_words(task: Task) -> frozenset[str]:
 
 @lru_cache(maxsize=4096)
 def ignored_words(skill: str, task: Task) -> str:
-    """Return the words of a skill that no step can express, and that a parser therefore ignores; "" if there are none.
+    """Return the words of a skill that the parser ignores because no step can express them; "" if there are none.
 
     Example:
         >>> ignored_words("push the puck three times, but do not touch the wall", TASKS["push"])
@@ -169,7 +169,7 @@ def _is_used(word: str, task: Task) -> bool:
 
 
 def has_certain_target(skill: str, task: Task) -> bool:
-    """Return whether the place of a skill is known: not in "opposite of the puck" or "outside the puck".
+    """Return whether a skill's target is certain, unlike in "opposite of the puck" or "outside the puck".
 
     Before the last object, an unknown word may only stand inside a noun phrase: "to the standoff pose above the puck".
     """
@@ -218,7 +218,7 @@ class StepRole:
     moved: str  # the object that moves
     target: str  # the object or point to move to
     manner: Manner
-    direction: Direction | None = None  # direction of the object's motion, also set while the hand approaches
+    direction: Direction | None = None  # direction of the object's motion; also set for steps that approach
     toward: str | None = None  # the object in the direction "goal"; None for the task's goal
     written: str = ""  # the skill as written in the plan; "" for an added step
     confidence: Probability = 1.0  # from 0 (a guess) to 1 (stated in the plan)
@@ -265,9 +265,9 @@ def motion_of(roles: Sequence[StepRole]) -> StepRole | None:
 def role_vectors(roles: Sequence[StepRole]) -> list[list[float]]:
     """Return a vector for each step of a plan that encodes the step's action without its objects.
 
-    The vector is a one-hot verb, a one-hot manner, and a flag for each (object, target) pair of the plan's motion that
-    MT10's experts move in an unusual way. Verbs with the same motion share an entry. The flags of fallback steps
-    describe the fallback plan's motion.
+    The vector is a one-hot verb, a one-hot manner, and flags: one for each (object, target) pair that MT10's experts
+    move in an unusual way, set if the plan's motion has this pair. Verbs with the same motion share an entry. The flags
+    of fallback steps describe the fallback plan's motion.
     """
     vectors = []
     motions = {fallback: motion_of([role for role in roles if role.fallback is fallback]) for fallback in (False, True)}

@@ -20,7 +20,7 @@ class _Tables(NamedTuple):
     moved: Tensor  # (T, 3*S) int64, index of each coordinate of the moved object
     gain: Tensor  # (T, 3*S) float64
     shift: Tensor  # (T, 3*S) float64, gain times offset
-    effort: Tensor  # (T, S, A) float64, actions with only the gripper's effort set
+    effort: Tensor  # (T, S, A) float64, actions that are zero except for the gripper's effort
     constants: Tensor  # (T, C) float64, indexed as if they followed the observation
 
 
@@ -72,7 +72,7 @@ class SkillProgram(nn.Module):
         self._tables = TaskTables(index, _Tables(target, moved, gain, shift, effort, fixed), "tasks without skills")
 
     def forward(self, observation: Tensor, task_id: Tensor) -> Tensor:
-        """Compute the action of each skill of each row's task.
+        """Compute the actions of all skills of each row's task.
 
         Args:
             observation: (..., D) float, in the tasks' layout.

@@ -104,7 +104,7 @@ def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
     """Load the scripted skills, keyed by their texts.
 
     Args:
-        path: a file in the format of data/skills.toml, whose skills are added to the shipped skills and replace those
+        path: a file in the format of data/skills.toml, whose skills are added to the shipped skills, replacing any
             with the same text; None for the shipped skills only.
         tasks: the tasks that the file's ``for`` tables may name, as returned by :func:`~lw_torchrl.load_tasks`.
 
@@ -120,7 +120,7 @@ def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
 
 @lru_cache(maxsize=256)
 def _foreign_words(task: Task) -> frozenset[str]:
-    """Return the last words of all object names in the 50 tasks, without words in the names of this task's objects."""
+    """Return the last words of all object names in the 50 tasks, except words in this task's object names."""
     own = {word for name in task.object_names for word in name.split()}
     return frozenset(named.name.split()[-1] for each in TASKS.values() for named in each.published.objects) - own
 
@@ -128,8 +128,8 @@ def _foreign_words(task: Task) -> frozenset[str]:
 def skills_for(task: Task, skills: Skills | None = None) -> Skills:
     """Return the skills that a task can use, chosen from ``skills`` (None for the shipped skills).
 
-    A task can use a skill if the task has the skill's objects and the skill's text mentions no object that only other
-    tasks have. A skill with a variant for the task may mention any object.
+    A task can use a skill if the task has the skill's objects and the skill's text mentions no object found only in
+    other tasks. A skill with a variant for the task may mention any object.
     """
     if skills is None:
         return _shipped_for(task)

@@ -20,7 +20,7 @@ _DIRECTIONS: dict[str, Direction] = {
 }
 _PLACES = {name: frozenset(words) for name, words in WORDS["canonical"]["places"].items()}
 _KNOWN = frozenset().union(*_VERBS.values()) | {"align", "slide", "sweep"}
-# The purpose in "put the gripper above the dial to turn it left", which a later step of the plan carries out.
+# The purpose ("to turn it left") in "put the gripper above the dial to turn it left"; a later step carries it out.
 _PURPOSE = re.compile(r"(?<=>) (?:in order )?to \w+ it\b.*")
 _IDLE = re.compile(
     r"(?:stop|wait|pause|finish|done|stay|rest|idle|hold|pass|return|success|(?:do|keep|hold|be) (?:nothing|still))"
@@ -43,12 +43,12 @@ class ParsedStep:
 
 
 def _stated(step: PlanStep) -> tuple[Clause, ...]:
-    """Return the clauses that a step's condition implies; if it implies none, all clauses that it mentions."""
+    """Return the clauses that a step's condition implies, or all clauses of the condition if none is implied."""
     return step.condition.implied or step.condition.clauses
 
 
 def compared_with_gripper(step: PlanStep) -> tuple[str, ...]:
-    """Return the objects, except obstacles, that a step's condition compares with the gripper, in its order."""
+    """Return the objects that a step's condition compares with the gripper, in order of mention, without obstacles."""
     pairs = [(clause.subject, clause.object) for clause in _stated(step) if clause.object is not None]
     names = (second if first == GRIPPER else first for first, second in pairs if GRIPPER in (first, second))
     return tuple(name for name in names if not is_obstacle(name))
@@ -64,7 +64,7 @@ class _Facts:
     not_aligned: bool
     open: bool
     closed: bool
-    near: tuple[str, ...]  # the objects, except obstacles, that the gripper is compared with
+    near: tuple[str, ...]  # the objects that the condition compares with the gripper, without obstacles
 
     @classmethod
     def of(cls, step: PlanStep) -> _Facts:
@@ -131,12 +131,12 @@ def skill_effect(skill: str, task: Task) -> Query | None:
 
 
 def _marked(skill: str, task: Task) -> str:
-    """Mark the objects in a skill, and remove what it forbids; return "" if no certain action remains."""
+    """Mark the objects in a skill, and remove forbidden actions; return "" if no certain action remains."""
     text, _, exception = instruction(skill)
     return "" if exception or rests(text) else mark_objects(text, task)
 
 
-# "it" right after the verb; elsewhere ("close around it") the condition identifies the object.
+# Match "it" only right after the verb. For "it" elsewhere ("close around it"), the condition identifies the object.
 _IT = re.compile(r"^(\w+) (?:it|them|her|him)\b")
 _MOVES = f"(?:{'|'.join(sorted((_VERBS['push'] | _VERBS['pull']) - {'close', 'shut'}))})"
 _NO_MOTION = {"approach", "beside", "descend", "close", "open"}
@@ -179,7 +179,7 @@ def _resolve_it(texts: Iterable[str], facts: Iterable[_Facts], task: Task) -> li
 
 
 def _only_sent(step: ParsedStep | None, text: str) -> ParsedStep | None:
-    """Parse "move the gripper to the block" as reaching, in a plan whose steps only move the gripper."""
+    """Parse "move the gripper to the block" as "reach"; only used if every step of the plan just moves the gripper."""
     goes_to = step and step.verb == "descend" and re.match(rf"\w+ <{GRIPPER}> (?:to|at|toward|onto) <", text)
     return replace(step, verb="reach") if step and goes_to else step
 
@@ -190,13 +190,13 @@ def _plain(text: str) -> list[str]:
 
 
 def _is_fist(text: str, facts: _Facts, is_first: bool) -> bool:
-    """Return whether "close the gripper" closes the fingers before they are at an object, in order to push it."""
+    """Return whether "close the gripper" makes a fist for pushing, that is, before the hand is at an object."""
     is_bare = text.startswith("close ") and "<" not in text.replace(f"<{GRIPPER}>", "")
     return is_bare and (bool(facts.near) or is_first) and not facts.at
 
 
 def _grasps(text: str, facts: _Facts, is_first: bool) -> bool:
-    """Return whether a step grasps or carries an object, or requires that the gripper is closed at an object."""
+    """Return whether a step grasps or carries an object, or requires the gripper to be closed at an object."""
     verb, *rest = text.split() or [""]
     if not text or _is_fist(text, facts, is_first):
         return False
@@ -231,10 +231,10 @@ class _StepParser:
         self.first = first_object(task)
         named = [name for name in re.findall(r"<([^>]+)>", text) if name != GRIPPER]
         self.named = [name for name in named if not is_obstacle(name) or name == self.first]
-        # "over the wall" and "around the wall" describe the way, not the target.
+        # "over the wall" and "around the wall" describe the path, not the target.
         self.obstacle = next((name for name in named if name not in self.named), None)
         self.leaves = any(not self.named or not same_object(task, name, self.named[0]) for name in starts)
-        # "move the gripper away from the mug" has no target that a step can have.
+        # "move the gripper away from the mug" only names what to leave, so the step has no target.
         self.only_leaves = bool(starts) and not self.named and (self.by_hand or self.verb not in _VERBS["lift"])
         self.tool = match[1] if (match := _TOOL.search(text)) else None
         if self.tool is not None:
@@ -251,7 +251,7 @@ class _StepParser:
         return replace(parsed, confidence=min(parsed.confidence, 0.8 if known else 0.6))
 
     def undoes(self) -> bool:
-        """Return whether the verb is the opposite of the task's or of a known verb: "unlock" in door-lock, "unshut"."""
+        """Return whether the verb is opposite to the task's ("unlock" in door-lock) or to a known verb ("unshut")."""
         goals, verb = self.task.name.split("-"), self.verb or self.step.skill.split()[0].lower()  # a noun in "lock it"
         stem = verb.removeprefix("un")
         return f"un{verb}" in goals or (stem != verb not in goals and stem in (*goals, *_KNOWN))
@@ -352,7 +352,7 @@ class _StepParser:
         return ParsedStep("push", GRIPPER, moved, direction or "goal", confidence=1.0 if pushed else 0.5, toward=toward)
 
     def _target(self, noun: str) -> str | None:
-        """Return the target of a moved object: from the step's words, else from the condition's comparisons."""
+        """Return a moved object's target, taken from the step's words or else from the condition's comparisons."""
         if goals := [name for name in self.named if is_goal(self.task, name)]:
             return goals[-1]
         for name in reversed(self.named[1:] if self.tool is None else self.named):

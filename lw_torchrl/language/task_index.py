@@ -36,7 +36,7 @@ def pick(table: Tensor, rows: Tensor) -> Tensor:
 
 
 class TaskIndex:
-    """An index from task ids to table rows, in the order of the ids; ``task_ids`` maps names to ids."""
+    """An index from task ids to table rows, which are in the order of the ids; ``task_ids`` maps names to ids."""
 
     def __init__(self, task_ids: Mapping[str, int]) -> None:
         names: dict[int, str] = {}
@@ -45,7 +45,7 @@ class TaskIndex:
                 raise ValueError(f"tasks {names[number]!r} and {name!r} have the same id, {number}; rename one of them")
             names[number] = name
         self.tasks = tuple(names[number] for number in sorted(names))
-        self._ids = torch.tensor([*sorted(names), -1])  # -1, never an id, ends the table
+        self._ids = torch.tensor([*sorted(names), -1])  # -1 is never an id and ends the table
 
     def row(self, task: str) -> int:
         """Return the row of a task's name."""
@@ -88,10 +88,10 @@ class PlanTables:
     Attributes:
         index: the index from task ids to the T rows.
         mask: (T, S) bool, true for plan steps, false for padding.
-        turns: (T, 6, S) bool, masks of the steps that a policy may choose in each turn of a cycle: the plan's own
-            steps, the fallback steps that release the object, the fallback steps with the first motion; then the plan's
-            own and the releasing steps again, and the fallback steps with the second motion. Without a fallback, each
-            turn has all steps.
+        turns: (T, 6, S) bool, masks of the steps that a policy may choose in each turn of a cycle: (1) the plan's
+            own steps, (2) the fallback steps that release the object, (3) the fallback steps with the first motion, and
+            then (1) and (2) again, followed by the fallback steps with the second motion. Without a fallback, each turn
+            has all steps.
         skill_index: (T, S) int64, the index of each plan step's skill in ``plans.skills``; 0 for padding.
         number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
     """
@@ -109,7 +109,7 @@ class PlanTables:
             back = {n: step.role.verb for n, step in enumerate(steps) if step.role is not None and step.role.fallback}
             own = [n for n in range(len(steps)) if n not in back]
             let_go = [n for n, verb in back.items() if verb in ("approach", "reach")]
-            motions = [n for n, verb in back.items() if verb in ("carry", "move")]  # one in files of earlier versions
+            motions = [n for n, verb in back.items() if verb in ("carry", "move")]  # one motion in old files
             first, second = ([n for n in back if n not in other] for other in (motions[1:], motions[:-1]))
             for turn, active in enumerate((own, let_go, first, own, let_go, second)):
                 self.turns[row, turn, active or own] = True
@@ -148,7 +148,7 @@ class PlanTables:
 def answers_of(qaf: Tensor, task_id: Tensor, number: Tensor | None, tables: PlanTables) -> tuple[Tensor, Tensor]:
     """Return ``qaf`` (..., S), and each task's row (...) int64 in ``tables`` of plans with S steps.
 
-    ``qaf`` may be longer than S, if it was computed for a larger set of plans. In this case ``qaf`` is cut to S if
+    ``qaf`` may be longer than S if it was computed for a larger set of plans. In this case ``qaf`` is cut to S if
     ``number`` (the ``qaf_plan``) shows that the tasks' plans are equal. A task without a plan or with another plan
     raises a ValueError.
     """
@@ -159,7 +159,7 @@ def answers_of(qaf: Tensor, task_id: Tensor, number: Tensor | None, tables: Plan
 
 
 class TaskTables(nn.Module, Generic[Tables]):
-    """A module with a named tuple of tables (T, ...), one row per task, that selects the rows for a batch.
+    """A module that holds a named tuple of tables (T, ...), one row per task, and selects the rows for a batch.
 
     The tables are buffers that move with the module, keep their precision and are not saved. The rows of the last batch
     are cached, since the next batch often has the same tasks. ``problem`` is as for :meth:`TaskIndex.rows`.
@@ -174,11 +174,11 @@ class TaskTables(nn.Module, Generic[Tables]):
         self._last: tuple[Tensor, _Kind, Tables] | None = None
 
     def plain(self, *tensors: Tensor) -> bool:
-        """Return whether the tensors and the tables have concrete values: not in ``vmap``, and not while compiling."""
+        """Return whether the tensors and the tables have concrete values, unlike in ``vmap`` or while compiling."""
         return plain(*tensors, next(iter(self._buffers.values())))  # type: ignore[arg-type]
 
     def select(self, task_id: Tensor, observation: Tensor) -> Tables:
-        """Return the tables' rows (B, ...) for task ids (B,) int64, in the observation's device and dtype."""
+        """Return the tables' rows (B, ...) for task ids (B,) int64, on the observation's device and in its dtype."""
         device, dtype = observation.device, observation.dtype
         if not self.plain(observation, task_id):
             return self._pick(self._to(device, dtype), task_id)

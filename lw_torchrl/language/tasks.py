@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _NAME = re.compile(r"([a-z][a-z0-9]*(-[a-z0-9]+)*/)?[a-z][a-z0-9]*(-[a-z0-9]+)*")
-_OWN_IDS = 2**31 - 50  # number of ids for custom tasks, which keeps every id within int32
+_OWN_IDS = 2**31 - 50  # number of ids for custom tasks; every id fits in an int32
 _MOST_OBJECTS = 64  # the number of base queries grows quadratically
 
 
@@ -151,7 +151,7 @@ def whole_objects(task: Task) -> tuple[str, ...]:
 
 
 def first_object(task: Task) -> str | None:
-    """Return the first object of a task's layout; None for a task with only a goal, such as reach."""
+    """Return the first object in a task's layout; None for a task with only a goal, such as reach."""
     first = typed_position(places(task.layout.positions[1]))
     return next((name for name in whole_objects(task) if typed_position(task.object(name).position) == first), None)
 
@@ -181,7 +181,7 @@ TaskList = str | Task | Iterable[str | Task]
 
 
 class _Shipped(dict[str, Task]):
-    """A dictionary with a short ``repr``, which ``help`` prints as the default of arguments."""
+    """A dictionary with a short ``repr``, since ``help`` prints it as the default of arguments."""
 
     def __repr__(self) -> str:
         return f"lw.TASKS, the {len(self)} tasks from {min(self)} to {max(self)}"
@@ -220,7 +220,7 @@ def task_id(name: str) -> int:
     """Return a task's integer id.
 
     The ids of the 50 Meta-World tasks are their ranks (from 0) among the sorted names. Any other name has an id from 50
-    to 2³¹ - 1 that depends only on the name, so a misspelled name has an id too.
+    to 2³¹ - 1 that depends only on the name, so even a misspelled name has an id.
 
     Example:
         >>> task_id("assembly"), task_id("window-open"), task_id("stack-blocks")
@@ -284,7 +284,7 @@ def get_task(task: str | Task, tasks: Tasks = TASKS) -> Task:
 
 
 def lists_by_task(argument: str, lists: Mapping[str | Task, Any]) -> dict[Task, list[Any]]:
-    """Return lists by :class:`Task`; raise a ValueError for no lists, an empty list or a repeated task."""
+    """Return lists keyed by :class:`Task`; raise a ValueError if there are none, one is empty or a task is repeated."""
     check_value(argument, lists, Mapping)
     tasks = (name if isinstance(name, Task) else TASKS[check_choice(argument, name, TASKS)] for name in lists)
     by_task = dict(zip(tasks, lists.values(), strict=True))
@@ -307,7 +307,7 @@ def one_layout(tasks: Iterable[Task]) -> Layout:
 def load_tasks(path: AnyPath) -> Tasks:
     """Load tasks from a file, and return them with the 50 Meta-World tasks, by name.
 
-    A task of the file replaces a Meta-World task with the same name.
+    A task in the file replaces a Meta-World task with the same name.
 
     Pass one of the returned tasks wherever a task is accepted, or the whole mapping as the ``tasks`` of
     :func:`~lw_torchrl.load_plans` and :func:`~lw_torchrl.resolve_tasks`.

@@ -86,7 +86,7 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
 
 
 def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
-    """Encode texts with ``encoder`` (None for :func:`encode_texts`), check the vectors and return (n, E) float32."""
+    """Encode n texts with ``encoder`` (None for :func:`encode_texts`), and return checked vectors (n, E) float32."""
     import torch
 
     vectors = (encoder or encode_texts)(texts)

@@ -64,7 +64,7 @@ def without_thoughts(text: str, notes: list[Note]) -> str:
 
     A ``</think>`` without ``<think>`` ends reasoning that began before the text, unless the tag is in a comment or more
     text follows on the line. A ``<think>`` without ``</think>`` means that the rest of the text is reasoning. A
-    ``<think>`` in a comment or a string is ignored. The tags of gpt-oss always count. Answers in JSON are unchanged.
+    ``<think>`` in a comment or a string is ignored. Tags of gpt-oss are never ignored. Answers in JSON are unchanged.
     """
     if _IS_JSON.match(text):
         return text

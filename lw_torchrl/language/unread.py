@@ -33,8 +33,8 @@ def unread(text: str, clauses: Sequence[Clause], notes: Sequence[Note], is_prose
 
     Args:
         clauses: the clauses of the steps.
-        notes: the other notes.
-        is_prose: whether the text is prose; of other texts, only prohibitions and rules are noted.
+        notes: the notes so far.
+        is_prose: whether the text is prose; in other texts, only prohibitions and rules are noted.
     """
     said = [*(clause.skill for clause in clauses), *(note.text for note in notes)]
     is_noted, is_said = _within(said), _within([*said, *(clause.reason for clause in clauses)])
@@ -65,7 +65,7 @@ def unread(text: str, clauses: Sequence[Clause], notes: Sequence[Note], is_prose
 
 
 def _prohibitions(line: str, is_said: Callable[[str], bool]) -> Iterator[str]:
-    """Yield a reason for each clause of a line that forbids an action."""
+    """Yield the text of a note for each clause of a line that forbids an action."""
     line = re.sub(r"^[\W\d]+|\*", "", line)
     for clause in cut(usual_words(line)) if forbids(line, is_whole=False) else ():
         words = {*re.findall(r"\w+", clause.text.lower())} - {"do", "does"}
@@ -75,7 +75,7 @@ def _prohibitions(line: str, is_said: Callable[[str], bool]) -> Iterator[str]:
 
 
 def _actions(line: str, is_said: Callable[[str], bool]) -> Iterator[str]:
-    """Yield a reason for each action of a line."""
+    """Yield the text of a note for each action of a line that no step or note contains."""
     for phrase in (part.strip(" -'") for part in _CLAUSES.split(line)):
         if 1 < len(phrase.split()) <= 40 and is_verb(phrase.split()) and not is_said(phrase):
             yield f"no step has the action {shown(phrase)}"
@@ -88,7 +88,7 @@ def _is_remark(item: str) -> bool:
 
 
 def _is_used(sentence: str, near: Sequence[set[str]], is_said: Callable[[str], bool]) -> bool:
-    """Return whether a step near a sentence, or a note, says what the sentence says."""
+    """Return whether a nearby step or a note already covers a sentence."""
     words = _words(sentence)
     parts = [part.strip(" -'") for part in _CLAUSES.split(sentence)]
     return any(2 * len(step & words) >= len(step) for step in near) or any(
@@ -101,7 +101,7 @@ def _words(text: str) -> set[str]:
 
 
 def _within(said: Sequence[str]) -> Callable[[str], bool]:
-    """Return a function of a phrase: whether one of the texts contains all of its words."""
+    """Return a function that checks whether one of the texts contains all words of a phrase."""
     words_said = [{*re.findall(r"[\w']+", each.lower())} for each in dict.fromkeys(said)]
 
     def is_said(phrase: str) -> bool:

@@ -30,8 +30,8 @@ class PlanAttention(Part):
 
     Padding steps get no attention. If no condition is true, the attention is uniform over the plan's steps.
 
-    Reads ``qaf`` (B, S) bool, or float in [0, 1] for soft truth, and ``task_id`` (B,) int64; for plans with fallback
-    steps also ``turn`` (B,) int64, see :class:`~lw_torchrl.transforms.FallbackTurns` (0 if absent). Writes
+    Reads ``qaf`` (B, S) bool, or float in [0, 1] for soft truth, and ``task_id`` (B,) int64. For plans with fallback
+    steps, also reads ``turn`` (B,) int64 (0 if absent), see :class:`~lw_torchrl.transforms.FallbackTurns`. Writes
     ``skill_weights`` (B, S) float32, whose rows sum to 1.
 
     Args:
@@ -80,7 +80,7 @@ class PlanAttention(Part):
     def with_plans(self, plans: AnyPlans) -> PlanAttention:
         """Return a :class:`PlanAttention` for different plans."""
         other = PlanAttention(plans, out_keys=self.out_keys_source)
-        # Either module may read a turn, whose key comes last.
+        # Only one of the modules may read a turn. The key of the turn comes last.
         other.in_keys = [*self.in_keys, *other.in_keys[len(self.in_keys) :]][: len(other.in_keys)]
         return in_mode_of(self, other.to(self.mask.device))
 

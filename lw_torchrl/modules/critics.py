@@ -1,4 +1,4 @@
-"""Critics, which estimate the values of states or actions and are built on the trunk of a policy."""
+"""Critics: networks that estimate the values of states or actions, built on a policy's trunk."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Value(RenamedInputs):
     heads, ``state_values`` (B, E) float32.
 
     Args:
-        trunk: the layers before the heads, such as :func:`plan_trunk`, or ``actor.trunk``, which actor and critic then
-            share. The last two keys that the trunk writes are a latent (B, D) and features (B, F).
+        trunk: the layers before the heads, such as :func:`plan_trunk`, or ``actor.trunk``, to share these layers with
+            the actor. The last two keys that the trunk writes are a latent (B, D) and features (B, F).
         ensemble: E, the number of heads. TorchRL's losses make ``num_qvalue_nets`` copies of the whole critic
             themselves, each with newly initialized weights.
         width, depth: units per hidden layer and number of hidden layers, each followed by a LayerNorm; a sequence of
@@ -134,7 +134,7 @@ class _OnPlanTrunk:
 
 
 class PlanConditionedValue(_OnPlanTrunk, Value):
-    """A :class:`Value` network on the trunk of :func:`plan_trunk`.
+    """A :class:`Value` network whose trunk is built by :func:`plan_trunk`.
 
     Reads ``qaf`` (B, S) bool, ``task_id`` (B,) int64 and ``observation`` (B, 39) float32; writes the same keys as
     :class:`Value`.

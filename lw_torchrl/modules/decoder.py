@@ -1,4 +1,4 @@
-"""Decoders, which map a skill latent and features to an action, or to the parameters of its distribution."""
+"""Decoders: networks that map a skill latent and features to an action or to the parameters of a distribution."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class MLPDecoder(_ActionMLP):
 
 
 class GaussianDecoder(_ActionMLP):
-    """An MLP that maps a latent and features (..., D + F) to the mean and standard deviation (..., A) of a Normal.
+    """An MLP that maps a latent and features (..., D + F) to the mean and standard deviation (..., A) of a Gaussian.
 
     Args:
         width, depth, actions: see :class:`MLPDecoder`.
@@ -141,8 +141,8 @@ class Decode(Part):
 
 
 def as_decoder(decoder: nn.Module, trunk: TensorDictSequential, out_keys: Keys | None = None) -> TensorDictModuleBase:
-    """Return a decoder for a trunk. A module that is not a TensorDict module is wrapped in :class:`Decode`, reads the
-    trunk's latent and features, and writes ``out_keys``."""
+    """Return a decoder for a trunk. A plain module is wrapped in :class:`Decode`, which reads the trunk's latent
+    and features and writes ``out_keys``."""
     width = encoding_width(trunk)
     network = decoder.network if isinstance(decoder, Decode) else decoder
     if width is not None and not isinstance(network, TensorDictModuleBase):

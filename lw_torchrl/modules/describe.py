@@ -28,7 +28,7 @@ _NETWORKS: dict[type[nn.Module], tuple[str, ...]] = {
     nn.Dropout: ("p",),
     nn.LayerNorm: ("normalized_shape", "eps", "elementwise_affine"),
 }
-"""The PyTorch modules that need no ``config``, and the arguments that reconstruct them."""
+"""The PyTorch modules that can be described without ``config``, and the names of their constructor arguments."""
 _SEQUENCES: dict[str, Any] = {"TensorDictSequential": TensorDictSequential, "Sequential": nn.Sequential}
 _KEYS = ("in_keys", "out_keys")
 
@@ -36,8 +36,8 @@ _KEYS = ("in_keys", "out_keys")
 def describe(module: nn.Module) -> dict[str, Any]:
     """Return a module's description, from which :func:`from_description` rebuilds the module with new random weights.
 
-    The description contains the import path of each part's class, and the constructor arguments in the part's attribute
-    ``config``: JSON values, plans, tasks, layouts and other modules.
+    The description contains the import path of each part's class, and the constructor arguments from the part's
+    attribute ``config``, which may be JSON values, plans, tasks, layouts and other modules.
 
     Raises:
         TypeError: a part has no ``config``; the message names the part.
@@ -116,8 +116,8 @@ def from_description(
     Args:
         description: a result of :func:`describe`.
         text_encoder: passed to parts that encode texts; None for the shipped sentence encoder.
-        parts: custom classes. A class is also found if its Python module is already imported. A description never
-            causes an import, because its file may be untrusted.
+        parts: custom classes. Other classes are found only in Python modules that are already imported: nothing is
+            imported, because a description may come from an untrusted file.
 
     Raises:
         ValueError: a class is unknown. A malformed description can raise any error.

@@ -30,7 +30,7 @@ class TaskLatent(Part):
     Reads ``task_id`` (B,) int64; writes ``task_latent`` (B, D) float32.
 
     Args:
-        tasks: the known tasks, see :func:`resolve_tasks`; a :class:`Task` contains its own description.
+        tasks: the known tasks, see :func:`resolve_tasks`; a :class:`Task` object holds its own description.
         condition: "description", the embedding of the description; "one-hot", a one-hot vector of the task.
         encoder: a module that maps T task vectors (T, E) float32 to latents (T, D); None for :class:`SkillEncoder`.
         text_encoder: a function that maps n texts to vectors (n, E) float32; None for the shipped sentence encoder.

@@ -1,4 +1,4 @@
-"""Features of an observation as inputs of a policy, normalized with statistics that the module stores."""
+"""Feature modules, which turn an observation into normalized inputs of a policy and store the statistics."""
 
 from __future__ import annotations
 
@@ -69,11 +69,11 @@ class Features(TensorDictModuleBase):
         return write(tensordict, self, [features])
 
 
-add_random_module(Features)  # so that losses that vmap over networks let each network draw its own noise
+add_random_module(Features)  # each network draws its own noise in losses that vmap over networks
 
 
 class ObservationFeatures(Features):
-    """A module that computes normalized features from the observation alone.
+    """A module that computes normalized features from the observation only.
 
     Reads ``observation`` (B, D) float; writes ``features`` (B, F), clipped to 10 standard deviations from the mean.
 
@@ -123,8 +123,8 @@ class ObservationFeatures(Features):
         return {"kind": self.kind, "noise": self.noise, "layout": self.layout, **keys}
 
     def with_plans(self, plans: AnyPlans) -> ObservationFeatures:
-        """Return features with the same statistics for the layout of different plans; raise a :class:`ValueError` if
-        the features have a different meaning in that layout."""
+        """Return a module with the same statistics for different plans; raise a :class:`ValueError` if the features
+        have a different meaning in the layout of those plans."""
         layout = as_plans(plans).layout
         if layout == self.layout:
             return self
@@ -236,8 +236,8 @@ def check_observation(observation: Tensor, layout: Layout) -> None:
 
 
 def relative(observation: Tensor, layout: Layout) -> Tensor:
-    """Return the differences between the positions of hand, objects and goal, in metres and squashed by tanh at 2 cm
-    and 10 cm, for Meta-World (..., 54). Differences to an absent object are 0."""
+    """Return the differences between the positions of hand, objects and goal, (..., 54) for Meta-World: in metres, and
+    squashed by tanh at scales of 2 cm and 10 cm. Differences to an absent object are 0."""
     positions = [observation[..., place] for place in layout.positions]
     # An all-zero position marks an absent object; only objects after the first can be absent.
     absent = {n: (positions[n] == 0).all(-1, keepdim=True) for n in range(2, len(positions) - 1)}

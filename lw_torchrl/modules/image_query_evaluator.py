@@ -18,7 +18,7 @@ from lw_torchrl.modules.query_evaluator import Answers, ClauseEvaluator, ClauseN
 from lw_torchrl.transforms.observations import CameraTransform
 
 KEYS = 32  # size of the learned vector that represents an object
-_KEPT = 16  # number of image features at an object's location from which its position is estimated
+_KEPT = 16  # number of image features, read at an object's location, that help to estimate its position
 _LANDMARKS = 32  # number of landmarks that are located in every picture
 _SHARP = 30.0  # scale of the attention scores; with 1, an untrained network would attend to the whole picture
 _LARGEST = 512  # maximum height and width of a picture, in pixels
@@ -48,11 +48,11 @@ def _conv(before: int, after: int, stride: int = 1) -> nn.Sequential:
 
 
 class PointingNetwork(ClauseNetwork):
-    """A network that locates objects in pictures and evaluates clauses about their positions.
+    """A network that locates objects in pictures and evaluates clauses about the objects' positions.
 
-    For each camera, the network compares an object's learned vector with the image features at every location, and a
-    softmax over the locations attends to the object. From the attended coordinates and features, and from the
-    coordinates of landmarks that all objects share, an MLP estimates the object's position in metres and its opening.
+    For each camera, the network compares an object's learned vector with the image features at every location. A
+    softmax over the locations gives the attention. An MLP estimates the object's position in metres and its opening
+    from the attended coordinates and features, and from the coordinates of landmarks, which all objects share.
 
     Source: the spatial softmax of 'Deep spatial autoencoders for visuomotor learning' (Finn et al., 2016).
     """
@@ -110,7 +110,7 @@ IMAGE_ENCODERS = Registry("image encoder", "lw_torchrl.image_encoders", {"small"
 class ImageQueryEvaluator(ClauseEvaluator):
     """A query evaluator that predicts conditions from camera pictures, with a network trained on exact answers.
 
-    Reads ``pixels`` (B, height, width·C, 3) uint8 of C cameras side by side, and ``task_id`` (B,) int64; writes
+    Reads ``pixels`` (B, height, width·C, 3) uint8, C camera images side by side, and ``task_id`` (B,) int64; writes
     ``qaf`` and ``qaf_logits`` (B, S) float32 as :class:`QueryEvaluator` does. See :class:`PointingNetwork` for the
     network. ``transform()`` returns the :class:`CameraTransform` that renders the pictures.
 
@@ -133,8 +133,8 @@ class ImageQueryEvaluator(ClauseEvaluator):
     network: PointingNetwork
     seen_dims = 3
     rows_at_once = 16
-    """Number of rows per forward pass in a rollout; fixed, so that results do not depend on other rows. With 4, some
-    processors round the last row differently."""
+    """Number of rows per forward pass in a rollout. The number is fixed so that a row's result does not depend on the
+    other rows. With 4 rows, some processors round the last row differently."""
 
     @typed
     def __init__(

@@ -46,7 +46,7 @@ class SkillEncoder(MLP):
 class SkillMixer(Part):
     """A module that encodes each skill's text to a latent, and mixes the latents by attention over the plan's steps.
 
-    If plan steps have roles (see :func:`~lw_torchrl.canonical_plans`), the module encodes the role's verb and manner
+    For plan steps with roles (see :func:`~lw_torchrl.canonical_plans`), the module encodes the role's verb and manner
     instead of the text.
 
     Reads ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes ``skill_latent`` (B, D) float32.

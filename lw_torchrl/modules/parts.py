@@ -29,7 +29,7 @@ Width = Count | Sequence[Count]
 
 
 class MLP(TorchRLMLP):
-    """TorchRL's MLP with ReLU, which concatenates its inputs; a sequence of widths overrides ``depth``."""
+    """TorchRL's MLP with ReLU, applied to the concatenated inputs. A sequence of widths overrides ``depth``."""
 
     def __init__(self, out_features: int, *, width: Width = 256, depth: int = 3, layer_norm: bool = False) -> None:
         widths = list(width) if isinstance(width, Sequence) else [width] * depth
@@ -61,7 +61,7 @@ def probe(module: nn.Module, example: Tensor) -> Any:
 
 @contextmanager
 def evaluating(network: nn.Module) -> Iterator[None]:
-    """Put a network into eval mode within a ``with`` block, and then restore the mode of every submodule."""
+    """Put a network into eval mode within a ``with`` block; restore the mode of every submodule afterwards."""
     modes = [(module, module.training) for module in network.modules()]
     network.eval()
     try:
@@ -100,8 +100,8 @@ class Part(TensorDictModuleBase):
 
 
 class RenamedInputs(TensorDictModuleBase):
-    """Base class for modules with assignable ``in_keys``: new keys also rename the keys that the submodules read, but
-    not the keys of other modules that share these submodules."""
+    """Base class for modules with assignable ``in_keys``. Assigning keys also renames the keys that the submodules
+    read, but not in other modules that share these submodules."""
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -123,7 +123,7 @@ class RenamedInputs(TensorDictModuleBase):
 
 
 def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool) -> Any:
-    """Return a copy of a module that shares the weights and reads renamed keys; ``copies`` holds earlier copies."""
+    """Copy a module; the copy shares the weights but reads renamed keys. ``copies`` holds earlier copies."""
     if not isinstance(module, (TensorDictModuleBase, nn.ModuleDict, nn.ModuleList)):
         return module
     if module not in copies:
@@ -137,8 +137,8 @@ def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[A
 def _rename_parts(
     module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool = False
 ) -> None:
-    """Replace a module's parts with copies that read renamed keys; if the parts run ``in_order``, a key that an
-    earlier part writes is not renamed in later parts."""
+    """Replace a module's parts with copies that read renamed keys. If the parts run ``in_order``, a key that an
+    earlier part writes keeps its name in later parts."""
     in_sequence, remaining, parts = isinstance(module, TensorDictSequential), renamed, {}
     for name, part in module._modules.items():
         parts[name] = _reading(part, remaining, copies, in_sequence)
@@ -173,7 +173,7 @@ class NamedParts(RenamedInputs, TensorDictSequential):
     def __setattr__(self, name: str, value: Any) -> None:
         parts = self.__dict__.get("_modules", {}).get("module") or {}
         if name not in parts:
-            # A misspelt part name would create an attribute that nothing uses. Users' subclasses may add modules.
+            # Otherwise, a misspelt part name would create an unused attribute. Custom subclasses may add modules.
             if parts and isinstance(value, nn.Module) and type(self).__module__.startswith("lw_torchrl."):
                 raise AttributeError(f"{type(self).__name__} has no part {name}, only {', '.join(parts)}")
             super().__setattr__(name, value)
@@ -221,8 +221,8 @@ def _plans_inside(part: nn.Module) -> Any:
 
 
 def follow(part: Any, plans: AnyPlans) -> Any:
-    """Return a part that follows ``plans`` with the networks of ``part``; return a part without plans unchanged. Raise
-    a :class:`TypeError` if the part follows plans but has no method ``with_plans``."""
+    """Return a part that follows ``plans`` and shares the networks of ``part``. A part without plans is unchanged.
+    Raise a :class:`TypeError` if the part follows plans but has no method ``with_plans``."""
     if hasattr(part, "with_plans"):
         return part.with_plans(plans)
     if isinstance(part, nn.Module) and _plans_inside(part) is None:
@@ -242,7 +242,7 @@ def _named_parts(trunk: TensorDictSequential) -> list[Any]:
 
 
 def trunk_attributes(trunk: TensorDictSequential) -> tuple[Any, Any, Layout]:
-    """Return ``(plans, tasks, layout)`` of a trunk's first part with a layout; None for plans or tasks it lacks."""
+    """Return ``(plans, tasks, layout)`` of a trunk's first part with a layout; missing plans or tasks are None."""
     part = next((part for part in _named_parts(trunk) if hasattr(part, "layout")), None)
     if part is None:
         raise ValueError("trunk must have a part with a layout: PlanAttention, SkillMixer, TaskLatent or features")

@@ -1,4 +1,4 @@
-"""PlanConditionedActor: a policy that follows a conditional plan, with four replaceable parts; StochasticActor."""
+"""Policies that follow conditional plans and have replaceable parts: PlanConditionedActor and StochasticActor."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def plan_trunk(
     features: nn.Module | None = None,
     text_encoder: TextEncoder | None = None,
 ) -> TensorDictSequential:
-    """Build a trunk of attention, mixer and features, which writes the latent of the active skills and the features.
+    """Build a trunk from attention, mixer and features. It writes the latent of the active skills and the features.
 
     Reads ``qaf`` (B, S) bool, ``task_id`` (B,) int64 and ``observation`` (B, 39) float32; writes ``skill_weights``
     (B, S), ``skill_latent`` (B, D) and ``features`` (B, F) float32. See :class:`PlanConditionedActor` for the
@@ -143,9 +143,9 @@ class ConditionedActor(NamedParts):
 class PlanConditionedActor(ConditionedActor):
     """The policy of Plan Conditioned Behavioral Cloning.
 
-    The policy attends to the skills whose conditions are true (to all equally if none is), mixes their latents, and
-    decodes the mixture and the observation's features into an action. The parts, for B rows, S steps in the
-    longest plan and latents of size D:
+    The policy attends to the skills whose conditions are true (to all skills equally if no condition is true), mixes
+    the latents of these skills, and decodes the mixture and the observation's features into an action. The table
+    lists the parts for B rows, S steps in the longest plan and latents of size D:
 
     ====================  ============================================  =================================
     part                  reads                                         writes
@@ -214,7 +214,7 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
     Args:
         trunk: a sequence of named parts, see :class:`ConditionedActor`.
         decoder: a TensorDict module that writes the Normal's mean and standard deviation.
-        distribution: "tanh_normal", a Normal squashed by tanh; "normal", whose actions the environment clips.
+        distribution: "tanh_normal", a Normal squashed by tanh; "normal", a Normal whose samples the environment clips.
         action: the key of the action.
 
     Example:

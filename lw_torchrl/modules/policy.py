@@ -45,7 +45,7 @@ def one_hot_actor(plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
 
 
 def make_policy(method: str, plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
-    """Make an untrained policy by the name of its method, for the tasks of ``plans``.
+    """Create an untrained policy of the named method for the tasks of ``plans``.
 
     Args:
         method: a name in :data:`METHODS`; an unknown name raises a :class:`ValueError` that suggests the nearest name.
@@ -87,7 +87,7 @@ def layout_of(actor: Any) -> Layout:
 
 
 def draws(actor: Any) -> bool:
-    """Return whether an actor draws random numbers without exploration, so that actions depend on earlier calls."""
+    """Return whether an actor draws random numbers even without exploration, so that actions depend on past calls."""
     return any(getattr(part, "draws", False) for part in _parts(actor))
 
 
@@ -105,12 +105,12 @@ def with_plans(actor: Any, plans: AnyPlans) -> Any:
 
 
 def transform_of(actor: Any, plans: Plans | None = None) -> Transform | None:
-    """Return a new transform that writes the keys that an actor reads but an environment lacks; None if it lacks none.
+    """Return a new transform that writes the keys that an actor reads but an environment lacks; None if there are none.
 
     Args:
         actor: any actor; the transforms of parts with a method ``transform()`` are included.
-        plans: plans whose conditions to check even if the actor does not read ``qaf``. None: the actor's plans if it
-            reads ``qaf``, otherwise no plans.
+        plans: plans whose conditions are checked even if the actor does not read ``qaf``; None for the actor's plans
+            if the actor reads ``qaf``, otherwise for no plans.
     """
     own, reads = plans_of(actor), list(getattr(actor, "in_keys", ()))
     transforms: list[Transform] = []

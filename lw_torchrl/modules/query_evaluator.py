@@ -1,4 +1,4 @@
-"""Query evaluators: learned modules that answer a policy's plan conditions instead of the exact function."""
+"""Query evaluators: learned modules that answer plan conditions, as replacements of the exact condition checker."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class QueryEvaluator(TensorDictModuleBase):
     Args:
         plans: the plans whose conditions the module answers.
         answers: the kind of answers in ``qaf``. "soft" is the probability, the sigmoid of the logit. "hard" is 1 where
-            the logit is positive and 0 elsewhere, with the gradient of "soft"; use it for a policy that was trained on
+            the logit is positive and 0 elsewhere, with the gradient of "soft"; choose "hard" for a policy trained on
             exact answers. A subclass that overrides the constructor must accept ``answers`` to support "hard".
 
     Example:
@@ -128,7 +128,7 @@ class QueryEvaluator(TensorDictModuleBase):
         return None
 
     def with_plans(self, plans: AnyPlans) -> QueryEvaluator:
-        """Return an evaluator for different plans that shares the weights; raise RuntimeError if they do not fit."""
+        """Return an evaluator for different plans that shares the weights; raise RuntimeError if these do not fit."""
         options: dict[str, Any] = dict(self.config)
         if "text_encoder" in signature(type(self)).parameters:
             options["text_encoder"] = self.text_encoder
@@ -160,8 +160,8 @@ _SCALES = (0.005, 0.02, 0.1, 0.5)  # metres, the scales at which tanh squashes a
 
 
 class Clauses(NamedTuple):
-    """A batch (...,) of clauses, possibly from different tasks. A clause is a predicate of the difference
-    ``observation[first] - observation[second] + shift``, three numbers."""
+    """A batch (...,) of clauses, possibly from different tasks. A clause applies a predicate to the
+    difference ``observation[first] - observation[second] + shift``, a vector of three numbers."""
 
     first: Tensor  # (..., 3) int64, indices into the observation; index D (past the end) reads 0
     second: Tensor  # (..., 3) int64
@@ -169,9 +169,9 @@ class Clauses(NamedTuple):
     predicate: Tensor  # (...) int64, an index into the list of predicates
     negated: Tensor  # (...) bool
     subject: Tensor  # (...) int64, an index into the list of names
-    object: Tensor  # (...) int64, an index into the list of names, or its length for a clause without an object
-    # Only for the clauses (T, C) of the plans of T tasks, which list each distinct clause of a plan once: the logic
-    # gates (see Gates) that combine the clauses into conditions. Input C of the gates is a constant, true.
+    object: Tensor  # (...) int64, an index into the list of names, or the list's length if there is no object
+    # The logic gates (see Gates) that combine clauses into conditions. Only set for the clauses (T, C) of T tasks'
+    # plans, where each distinct clause of a plan is listed once. Input C of the gates is the constant true.
     inputs: Tensor = torch.empty(0, dtype=torch.int64)
     flipped: Tensor = torch.empty(0, dtype=torch.bool)
 
@@ -184,8 +184,8 @@ class ClauseEvaluator(QueryEvaluator):
     """Base class for query evaluators whose networks are trained on exact answers.
 
     Reads a view of a state, such as an observation or pictures, and ``task_id``; writes the keys of
-    :class:`QueryEvaluator`, with logits of -1e4 beyond a plan's last step. The network answers single clauses, which
-    the plans' conditions combine as independent statements: P(A and B) = P(A) P(B), and
+    :class:`QueryEvaluator`, with logits of -1e4 beyond a plan's last step. The network answers single clauses.
+    The plans' conditions combine the answers as if the clauses were independent: P(A and B) = P(A) P(B), and
     P(A or B) = 1 - P(not A) P(not B). Gradients reach every clause. A subclass sets ``network``, which maps views of B
     states and their clauses (B, C) to logits (B, C), and ``seen_dims``, the number of dimensions of a view.
 
@@ -309,7 +309,7 @@ def _compared(clause: Clause, task: Task) -> tuple[list[int], list[int], list[fl
 
 
 def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
-    """Return the indices of an object's three coordinates in an observation, and the offsets to add to them."""
+    """Return the indices of an object's three coordinates in an observation, and offsets to add to the values."""
     item = task.object(name)
     index = [at if isinstance(at, int) else task.layout.size for at in item.position]
     fixed = [0.0 if isinstance(at, int) else at for at in item.position]
@@ -317,8 +317,8 @@ def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
 
 
 class ClauseNetwork(nn.Module):
-    """A network that maps clauses to logits: the dot product of an MLP of the difference of two positions and a
-    learned vector of the predicate, plus a bias. "not" flips the sign."""
+    """A network that maps clauses to logits. A logit is a bias plus the dot product of the predicate's learned vector
+    and the output of an MLP, whose input is the difference of two positions. "not" flips the sign."""
 
     numbers: int = 3  # components of a difference
 

@@ -27,13 +27,13 @@ from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
 _SCALE = 0.1  # metres, the unit of positions in the features
 _FAR = 0.25  # metres; longer relative positions, which are rare in demonstrations, are shortened to this length
 _LIFTED = 0.15  # metres, the height at which an object is carried above its target
-_AWAY = 0.15  # metres, the distance of the target of "move the puck to the left"
+_AWAY = 0.15  # metres, the distance from the puck to the target of "move the puck to the left"
 _KEYS = ("observation", "skill_weights", "task_id")
 Pair = tuple[NamedObject, NamedObject]
 
 
 class _RelativePositions(Features):
-    """Base class for features that are relative positions of objects, mixed by the attention over a plan's steps.
+    """Base class for features that average relative positions of objects over plan steps, weighted by attention.
 
     ``pairs`` returns at most ``number`` = P pairs of objects for each plan step. The features contain the position of
     each pair's second object relative to the first, and zeros for missing pairs.
@@ -57,8 +57,8 @@ class _RelativePositions(Features):
         self.plans = plans = as_plans(plans)
         self.tables = PlanTables(plans)
         self.width = 9 * number
-        # Coordinates are indices into the observation followed by constants, the coordinates of fixed positions. The
-        # first constant is 0; a missing pair is the difference of two such zeros.
+        # A coordinate is an index into the observation with constants appended: the coordinates of fixed positions.
+        # The first constant is 0. For a missing pair, both coordinates are this constant.
         constants = [0.0]
         shape = (len(plans), plans.num_steps, number, 3)
         self.layout, size = plans.layout, plans.layout.size
@@ -131,9 +131,9 @@ class FocusFeatures(_RelativePositions):
     so the policy can transfer its behavior between tasks.
 
     Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes
-    ``features`` (B, 18). For each of two clauses, the first and the last with two objects, these are 9 numbers: the
-    position of the second object relative to the first, in units of 10 cm and squashed by tanh at 2 cm and at 10 cm. A
-    plan step without such clauses has zeros.
+    ``features`` (B, 18). There are 9 numbers for each of two clauses, the first and the last that compare two objects:
+    the second object's position relative to the first object, in units of 10 cm and squashed by tanh at 2 cm and at
+    10 cm. A plan step without such clauses has zeros.
 
     Args:
         plans: the plans whose conditions name the objects.
@@ -156,8 +156,8 @@ class RoleFeatures(_RelativePositions):
     """Features of the active plan step: the target's position relative to the moved object, and the motion direction.
 
     "lower the gripper around the puck" and "... the mug" are the same motion in these features, so policies can
-    transfer it between tasks. Offsets longer than 25 cm are shortened to 25 cm. The targets are the points at which
-    demonstrations touch an object, its *contacts*, which :meth:`fit` computes. In a task without demonstrations, the
+    transfer it between tasks. Offsets longer than 25 cm are shortened to 25 cm. The targets are *contacts*, the points
+    at which demonstrations touch an object, computed by :meth:`fit`. In a task without demonstrations, the
     target is the point that the plan names, and a carried object is first lifted to 15 cm above the target.
 
     Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64, and the outputs
@@ -288,8 +288,8 @@ class RoleFeatures(_RelativePositions):
         positions = super().of_steps(observation, rows) + contact.unsqueeze(-2)
         lifts = (pick(self.lifts, rows) & ~pick(self.demonstrated, rows).unsqueeze(-1))[..., None, None]
         sideways, height = positions[..., :2], positions[..., 2:]
-        # Until the object is over its target, within 3 to 7 cm, the target is 15 cm higher; until the object is nearly
-        # that high, it does not move sideways.
+        # While the object is more than 3 to 7 cm to the side of its target, the target is raised by 15 cm. Until the
+        # object is nearly at that height, it does not move sideways.
         distance = sideways.norm(dim=-1, keepdim=True)
         height = height + _LIFTED * ((distance - 0.03) / 0.04).clamp(0.0, 1.0) * lifts
         lifted = torch.where(lifts, ((0.06 - height) / 0.04).clamp(0.0, 1.0), 1.0)
@@ -326,7 +326,7 @@ def _moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
 
 
 def _ahead(plan: ConditionalPlan) -> list[list[Pair]]:
-    """Return the pair (first object, target) of each plan step that moves toward the goal or an object, else []."""
+    """Return, for each plan step, the pair (first object, target) if it moves toward the goal or an object, else []."""
     task = plan.definition
     x, y, z = places(task.layout.positions[1])
     first = NamedObject("first object", (x, y, z))

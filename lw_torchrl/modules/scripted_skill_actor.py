@@ -24,8 +24,8 @@ from lw_torchrl.transforms.qaf import read_truth
 class ScriptedSkillActor(Part):
     """A policy that executes plans with scripted skills.
 
-    At each time step, the skill of a plan step whose condition is true acts. If no condition is true, the last step's
-    skill acts.
+    At each time step, the actor executes the skill of a plan step whose condition is true, or the skill of the last
+    plan step if no condition is true.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
     truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, whose rows sum to 1. Soft

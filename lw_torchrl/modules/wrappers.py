@@ -27,7 +27,7 @@ class _Wrapper(RenamedInputs):
     _options: ClassVar[Sequence[str]]
 
     def _wrap(self, actors: Sequence[TensorDictModuleBase], out_keys: Sequence[NestedKey]) -> None:
-        """Set the input keys to those of all actors, and plans, tasks and layout to those of the first actor."""
+        """Read the input keys of all actors, and take plans, tasks and layout from the first actor."""
         self.plans, self.tasks, self.layout = plans_of(actors[0]), tasks_of(actors[0]), layout_of(actors[0])
         self.in_keys = list(dict.fromkeys(key for actor in actors for key in actor.in_keys))
         self.out_keys = list(out_keys)
@@ -104,7 +104,7 @@ class ActorEnsemble(_Wrapper):
 
 
 class DecidedGripper(_ActionWrapper):
-    """A wrapper that opens or closes the gripper fully, except during training; half-closed fingers drop objects.
+    """A wrapper that fully opens or closes the gripper, because half-closed fingers drop objects; inactive in training.
 
     Reads and writes the actor's keys; the gripper effort in ``action`` (B, A) is -1 or 1.
 
@@ -214,15 +214,15 @@ class DemonstratedActor(_Wrapper):
 class TransferredActor(_ActionWrapper):
     """A wrapper that runs an actor on another suite's plans, and converts the actions to that suite's layout.
 
-    By default, displacements in [-1, 1] stay the same, so the largest displacement moves the hand as fast as the new
-    robot can. With ``speed``, the hand moves ``speed`` times as many metres per time step as in the training suite. A
+    By default, displacements in [-1, 1] stay the same, so the largest displacement is the fastest motion of the new
+    robot. With ``speed``, the hand moves ``speed`` times as many metres per time step as in the training suite. A
     binary gripper closes at an effort above the new layout's ``closes_above``.
 
     Reads the actor's input keys, in the other layout; writes ``action`` (B, A) float32 in [-1, 1] and the actor's other
     output keys.
 
     Args:
-        actor: an actor whose features have the same meaning in both layouts: :class:`RoleFeatures` and "opening".
+        actor: an actor whose features have the same meaning in both layouts: :class:`RoleFeatures`, or kind "opening".
         plans: plans for the other suite's tasks.
         speed: the hand's metres per time step, relative to the training suite; None to keep displacements the same.
         trained: the layout with which the actor was trained; None for the actor's layout.

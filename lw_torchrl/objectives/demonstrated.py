@@ -53,8 +53,8 @@ class _ImitatesDemonstrations(_Loss):
         self._in_keys.append(self.tensor_keys.is_demonstration)
 
     def _imitation(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        """Return the squared distance (B,) float32 of actions (B, A) to the demonstrated ones; 0 for rows that are not
-        demonstrations. It is scaled so that its mean over all rows is the mean over the demonstrations."""
+        """Return the squared distance (B,) float32 of actions (B, A) to the demonstrated actions; 0 for all other rows.
+        The distance is scaled so that the mean over all rows equals the mean over the demonstrations."""
         key = self.tensor_keys.is_demonstration
         (is_demonstration,) = read(tensordict, [key])
         if is_demonstration.dtype != torch.bool:

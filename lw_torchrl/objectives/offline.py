@@ -26,7 +26,7 @@ class ExpectileValueLoss(LossModule):
     """A loss that trains a state-value network V by expectile regression, without a state-action value network.
 
     The loss of a row is |τ - 1(u < 0)|·u², where u is the target minus V. The target is the reward plus the discounted
-    value of the next state by the target network (n time steps ahead if the rows have ``steps_to_next_obs``). With an
+    value of the target network in the next state (n time steps ahead if the rows have ``steps_to_next_obs``). With an
     expectile above 0.5, V approaches the value of the better actions. :class:`AdvantageWeightedLoss` uses u as the
     advantage.
 
@@ -264,7 +264,7 @@ class AdvantageWeightedLoss(LossModule):
         return losses
 
     def _distance(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        """Return the distance (B,) of each row's action."""
+        """Return the distance (B,) between the actor's action and the action to imitate in each row."""
         inputs = tensordict.exclude(self.tensor_keys.action)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             if self.loss_function == "log_prob":
@@ -307,7 +307,7 @@ def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
 
 @typed
 def with_n_steps(loss: LossModule, batch: TensorDictBase) -> TensorDictBase:
-    """Prepare a batch of n-step rows, and a loss's value estimator, for ``loss(with_n_steps(loss, batch))``.
+    """Prepare a batch of n-step rows and the loss's value estimator for ``loss(with_n_steps(loss, batch))``.
 
     TorchRL's :class:`~torchrl.objectives.IQLLoss` and :class:`~torchrl.objectives.REDQLoss` pass only ``next`` to the
     estimator, so this function copies ``steps_to_next_obs`` into ``next`` and sets the estimator's key. For any other

@@ -41,7 +41,7 @@ class PlannerError(RuntimeError):
 
 @dataclass(frozen=True)
 class Tokens:
-    """The numbers of prompt tokens and completion tokens as reported by the server, or 0 if not reported."""
+    """The numbers of prompt tokens and completion tokens that the server reported; 0 if it reported none."""
 
     prompt: int = 0
     completion: int = 0
@@ -110,7 +110,7 @@ def read_reply(
     skills: Skills | None = None,
     schema: Mapping[str, Any] | None = None,
 ) -> Answer:
-    """Decode the plan in a reply. With a ``schema`` the reply should be JSON, which is converted to ``format``."""
+    """Decode the plan in a reply. With a ``schema``, expect JSON in the reply and convert the JSON to ``format``."""
     read = PLAN_FORMATS[format].read if schema is None else read_structured
     raw = _storable(reply.text)
     decoded = decode_as(raw, read, StepMapper(task, skills))
@@ -184,7 +184,7 @@ def answer_text(answer: str | Path) -> str:
 
 
 def _answers_in_folder(root: Path) -> Iterator[tuple[str, _Place, Path]]:
-    """Yield (model, place, path) for each answer file in a folder."""
+    """Yield (model, (format, task, attempt), path) for each answer file in a folder."""
     for name, format in PLAN_FORMATS.items():
         for path in root.glob(f"*/{name}/*.{format.extension}"):
             match = re.fullmatch(r"([a-z][a-z0-9-]*)-(\d{1,9})", path.stem)
@@ -214,7 +214,7 @@ def _answers_in_lines(file: Path) -> Iterator[tuple[str, _Place, str]]:
 
 @runtime_checkable
 class Planner(Protocol):
-    """The interface of planners, which write plans; for example, :class:`~lw_torchrl.OpenAIPlanner`."""
+    """The interface of a planner, which writes plans: for example, :class:`~lw_torchrl.OpenAIPlanner`."""
 
     @property
     def name(self) -> str:
@@ -246,7 +246,7 @@ class FilePlanner:
             file with the keys "llm", "format", "task", "attempt" and "completion" on each line.
         model: the name of the model whose answers to load; None if the source has only one model.
 
-    ``name`` is the model's name as a folder name; ``recorded`` is a sorted tuple with each (format, task, attempt).
+    ``name`` is the model's name as a folder name. ``recorded`` is a sorted tuple of all (format, task, attempt).
 
     Example:
         >>> import json, pathlib, lw_torchrl as lw

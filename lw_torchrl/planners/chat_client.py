@@ -25,7 +25,7 @@ _KEY = "OPENAI_API_KEY"
 _PROXIES = ("ALL_PROXY", "HTTP_PROXY", "HTTPS_PROXY")
 _VARIABLES = (*_PROXIES, "NO_PROXY", "SSL_CERT_FILE", "SSL_CERT_DIR")  # these change how a server is reached
 # Fallbacks for servers that reject a field, each with a pattern of the server's error message. "no system message"
-# prepends the system message to the user's message; chat templates without a system role report it in many ways.
+# prepends the system message to the user's message; templates without a system role word their errors in many ways.
 _FALLBACKS = {
     "max_completion_tokens": "max_completion_tokens",  # instead of max_tokens
     "json_object": "response_format|json_schema",  # as the type of response_format, instead of json_schema
@@ -36,7 +36,7 @@ _FALLBACK_NOTES = {
     "json_object": "the schema was sent as json_object, since the server rejects json_schema",
     "no system message": "the system message was sent as part of the user's message, since the server rejects it",
 }
-# Patterns of errors that a server reports with status 200 and without a numeric code, and the status each should have.
+# Patterns of errors that servers report with status 200 and without a numeric code, with the status to use instead.
 _STATUSES = {
     429: r"rate.?limit|too many requests|quota|overloaded|capacity",
     401: r"api.?key|unauthori[sz]ed|authentication",
@@ -45,7 +45,7 @@ _STATUSES = {
 
 
 def server_address(base_url: str | None) -> str:
-    """Check a server's address, and return the address without user name, password and query."""
+    """Check a server's address and return it without the user name, the password and the query."""
     name, given = "base_url", base_url
     if not base_url and os.environ.get("OPENAI_BASE_URL"):
         name, given = "the environment variable OPENAI_BASE_URL", os.environ["OPENAI_BASE_URL"]
@@ -92,7 +92,7 @@ class ChatClient:
             limited = _limited(openai, timeout, refusals=0 if self._is_local else 1)
             options |= {"http_client": limited(**options, **own), "max_retries": retries}
             self._client = openai.OpenAI(api_key=key or "none", base_url=base_url, **options)
-        except Exception as error:  # httpx and ssl raise many kinds of errors for invalid environment variables
+        except Exception as error:  # for invalid environment variables, httpx and ssl raise errors of many types
             advice = f"check the environment variables of proxies and certificates{self._environment()}"
             what = f"the HTTP client cannot be created ({_excerpt(str(error))})"
             raise PlannerError(f"{what}; {advice}", fatal=True) from None
@@ -177,7 +177,7 @@ class ChatClient:
         return f" (set in the environment: {', '.join(names)}{ignored})" if names else ""
 
     def _without_key(self, text: Any) -> Any:
-        """Redact the API key in a text or in bytes. Keep a key of under 8 characters, which may be a common word."""
+        """Redact the API key in a text or in bytes, except a key of under 8 characters, which may be a common word."""
         key, hidden = self._key, "(the key)"
         if len(key) < 8:
             return text
@@ -217,7 +217,7 @@ def _limited(openai: Any, timeout: float, refusals: int) -> Any:
 
 
 def _status(status: int, content: bytes) -> int:
-    """Correct the HTTP status of a reply, from which the client decides whether to retry.
+    """Return the corrected HTTP status of a reply; the client uses the status to decide whether to retry.
 
     Some gateways report an error with status 200, and some servers report a rejected field with status 500.
     """
@@ -331,7 +331,7 @@ def _read_completion(content: bytes) -> tuple[Reply, str]:
 
 
 def _join_parts(content: Any) -> tuple[str, str]:
-    """Return the answer and the refusal in a message's content (a text or a list of parts), without reasoning."""
+    """Return the answer and the refusal in a message's content (a text or a list of parts); drop the reasoning."""
     answer = refusal = ""
     for part in content if isinstance(content, list) else [content]:
         text = part
@@ -343,7 +343,7 @@ def _join_parts(content: Any) -> tuple[str, str]:
 
 
 def _text(value: Any) -> str:
-    """Remove lone surrogates, which cannot be written to a file, from a text; return "" for any other type."""
+    """Remove lone surrogates from a text, since files cannot store them; return "" for any other type."""
     return value.encode("utf-8", "replace").decode() if isinstance(value, str) else ""
 
 

@@ -43,18 +43,18 @@ class OpenAIPlanner:
     """A planner that requests plans from an OpenAI-compatible server: OpenAI, vLLM, Ollama or llama.cpp.
 
     The API key is read from the environment variable OPENAI_API_KEY; a local server needs no key. Each answer is cached
-    under a hash of everything that determines the answer (:meth:`request`), and is not requested again.
+    under a hash of everything that determines it (:meth:`request`), and is not requested again.
 
     Args:
         model: the name of the model on the server.
         base_url: the server's address, such as "http://127.0.0.1:8000/v1"; None for OPENAI_BASE_URL or OpenAI's server.
         constrain: constrain the model's answers to JSON that follows the task's :func:`plan_schema`.
-        free_skills: with ``constrain``, allow free-form skills, not only scripted skills.
+        free_skills: with ``constrain``, allow free-form skills as well as scripted skills.
         skills: the scripted skills to choose from; None for the shipped skills.
         plans, vocabulary: see :func:`plan_prompt`.
         temperature: the sampling temperature; None for the server's default.
         max_tokens: maximum number of tokens per answer; reasoning models need more.
-        seed: the seed; attempt k is requested with ``seed + k``; None sends no seed.
+        seed: the random seed. Attempt k is requested with ``seed + k``; None sends no seed.
         options: further fields of the request, such as ``{"top_p": 0.9}``.
         name: the name of the answers' folder; None for the model's name, plus "-constrained" with ``constrain``.
         cache: the folder for cached answers.
@@ -169,7 +169,7 @@ class OpenAIPlanner:
         out: AnyPath | None = None,
         progress: bool = True,
     ) -> Answers:
-        """Report to the model how its plans performed, and request a revised answer for each plan.
+        """Report to the model how its plans performed, and request a revision of each plan.
 
         Args:
             answers: the answers to revise, all in one format.
@@ -197,7 +197,7 @@ class OpenAIPlanner:
     def _answers(
         self, questions: list[Question], format: str, name: str, out: AnyPath | None, progress: bool
     ) -> Answers:
-        """Answer questions from the cache, or from the server if not cached."""
+        """Answer questions from the cache, and request the missing answers from the server."""
         answers: list[Answer] = []
         missing: list[Question] = []
         for question in questions:
@@ -230,7 +230,7 @@ class OpenAIPlanner:
         return read_reply(reply, question.task, format, question.attempt, self.skills, question.request["schema"])
 
     def cache_path(self, request: Mapping[str, Any]) -> Path:
-        """Return the path of the cached reply to a request, which contains a hash of the request."""
+        """Return the path of the cached reply to a request. The path contains a hash of the request."""
         key = sha256(json.dumps([_CACHE_VERSION, request], sort_keys=True).encode()).hexdigest()
         return self.cache / key[:2] / f"{key}.json"
 

@@ -1,4 +1,4 @@
-"""Prompts that request plans, plans in JSON, and the JSON Schema that constrains a model to plans for one task."""
+"""Prompts that request plans, plans as JSON, and JSON Schemas that restrict a model's output to plans for one task."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _EXAMPLES = 3
 
 
 def prompt_examples(task: str | Task, plans: AnyPlans | None = None) -> tuple[ConditionalPlan, ...]:
-    """Return the example plans for a prompt: the pick-place plan, and those for tasks with similar descriptions.
+    """Return the example plans for a prompt: the pick-place plan, and plans for tasks with similar descriptions.
 
-    Up to three plans are returned, never the task's own. The task whose description is nearest by edit distance
+    Up to three plans are returned, excluding the task's own. The task whose description is nearest by edit distance
     comes last, right before the request.
 
     Args:
@@ -106,7 +106,7 @@ class Question(NamedTuple):
 def chat_messages(
     task: Task, format: str, plans: AnyPlans | None, vocabulary: bool, constrain: bool
 ) -> list[dict[str, str]]:
-    """Build the system message, which asks for the plan only, and the user message, which holds the prompt.
+    """Build a system message that requests only the plan, and a user message with the prompt.
 
     If the model's output is constrained, the system message also shows the last example as JSON.
     """
@@ -198,7 +198,7 @@ def _read_query(value: Any) -> str:
     return " and ".join(f"({text})" if len(texts) > 1 and " or " in text else text for text in texts)
 
 
-# Limits that stop a model that repeats itself; shipped plans have at most 6 steps, with at most 5 clauses each.
+# Limits that cut off a model that repeats itself. Shipped plans have at most 6 steps with at most 5 clauses each.
 MOST_STEPS, MOST_CLAUSES = 8, 5
 _SKILL = "^[a-z]+( [a-z'-]+){1,12}$"
 _BECAUSE = "^[A-Za-z0-9,.:;'-]+( [A-Za-z0-9,.:;'-]+){1,29}$"
@@ -255,7 +255,7 @@ def passes(value: Any, schema: Mapping[str, Any]) -> bool:
 
 
 def _clauses(task: Task) -> list[dict[str, Any]]:
-    """Build schemas for clauses, in which each subject and predicate allow only the objects of supported queries."""
+    """Build schemas for clauses that allow, for each subject and predicate, only the objects of supported queries."""
     seconds = defaultdict[tuple[str, str], list[str | None]](list)
     for clause in base_clauses(task, tuple(PREDICATES)):
         predicate = f"not {clause.predicate}" if clause.negated else clause.predicate

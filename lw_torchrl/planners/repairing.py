@@ -20,7 +20,7 @@ from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.planners.answer_files import CUT_OFF, Answer
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
 
-_GAPS = 3  # number of gaps to print, longest first
+_GAPS = 3  # number of gaps (runs of steps without a true condition) to print, longest first
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class PlanCheck:
 
     task: str
     decoded: DecodedPlan
-    expert: TaskUse | None = None  # the plan's conditions in the expert's states; None without a plan
-    own: TaskUse | None = None  # the plan's conditions in its own episodes; None if a step has no scripted skill
+    expert: TaskUse | None = None  # how often conditions hold in the expert's states; None without a plan
+    own: TaskUse | None = None  # how often they hold in the plan's own episodes; None if a step lacks a scripted skill
     success: float = 0.0  # success rate with scripted skills
     failed: tuple[Tensor, ...] = ()  # observations (T, 39) float32 of each failed episode
 
     @property
     def never(self) -> tuple[int, ...]:
-        """The plan steps (from 0) whose condition was never true in the episodes of the expert and of the plan."""
+        """The plan steps (from 0) whose condition was never true, either in the expert's or in the plan's episodes."""
         if self.expert is None:
             return ()
         own = [0.0] * len(self.expert.true) if self.own is None else self.own.true
@@ -68,7 +68,7 @@ class PlanCheck:
 
 
 def _written(text: str, distance: float) -> str:
-    """Return a remark with the replaced text and its distance; "" if the text was not replaced."""
+    """Return a remark with the original text and its distance; "" if the text was not replaced."""
     return f"   <- {text!r} ({distance:.2f})" if distance else ""
 
 
@@ -126,7 +126,7 @@ def _check_decoded(decoded: DecodedPlan, task: Task, episodes: int, seed: int, s
 
 @dataclass(frozen=True)
 class Repair:
-    """An answer and its revisions (one per round), with the check of each."""
+    """An answer, its revisions (one per round), and the checks of the answer and of each revision."""
 
     answers: tuple[Answer, ...]
     checks: tuple[PlanCheck, ...]
@@ -165,7 +165,7 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
 
 
 def _distances(task: Task, failed: Iterable[Tensor]) -> list[str]:
-    """Report the least and final distances (cm) of gripper and objects, as medians over failed episodes."""
+    """Report the minimum and final distances (cm) between gripper and objects, as medians over failed episodes."""
     episodes = [task.published.positions(observation) for observation in failed]
     if not episodes:
         return []

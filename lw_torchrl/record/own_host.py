@@ -42,7 +42,7 @@ class _Handler(StreamRequestHandler):
             return
         kept = [line for line, (name, _) in zip(lines, headers, strict=True) if name != b"connection"]
         with suppress(OSError), self._connected() as backend:
-            backend.sendall(b"".join([*kept, b"Connection: close\r\n\r\n"]))  # so each request is checked
+            backend.sendall(b"".join([*kept, b"Connection: close\r\n\r\n"]))  # no reuse, so each request is checked
             Thread(target=_copy, args=(self.request, backend), daemon=True).start()
             _copy(backend, self.request)
 

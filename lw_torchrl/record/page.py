@@ -123,7 +123,7 @@ def log_lanes(
 
 
 def _log_active_step(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, kind: str = "") -> None:
-    """Log the active plan step (1-based) as a lane; ``kind`` is a prefix that keeps two logged plans apart."""
+    """Log the active plan step (1-based) as a lane; ``kind`` is a prefix that distinguishes two logged plans."""
     assert episode.active is not None
     count = max(len(episode.steps), int(episode.active.max()) + 1)
     labels = [f"{i} {skill}" for i, (_, skill) in enumerate(episode.steps, 1)] or map(str, range(1, count + 1))

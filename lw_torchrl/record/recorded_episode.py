@@ -50,7 +50,7 @@ class TargetPose(NamedTuple):
 class RecordedEpisode:
     """One episode of T rows as validated arrays on the CPU; S is the number of plan steps."""
 
-    action: NDArray[np.float32]  # T×A in [-1, 1], in Meta-World displacement xyz and gripper effort; A may be 0
+    action: NDArray[np.float32]  # T×A in [-1, 1] (in Meta-World: xyz displacement, gripper effort); A may be 0
     objects: dict[str, NDArray[np.float32]]  # name -> T×3 positions in metres; includes the gripper if layout is given
     layout: Layout | None = METAWORLD  # None if the robot's layout is unknown: only objects are drawn
     observation: NDArray[np.float32] | None = None  # T×D, described by the layout; metres, gripper opening in [0, 1]
@@ -60,7 +60,7 @@ class RecordedEpisode:
     success: NDArray[np.bool_] | None = None  # T, success in the state after the row's action
     reward: NDArray[np.float32] | None = None  # T, reward of the row's action
     steps: tuple[tuple[str, str], ...] = ()  # S (condition, skill) texts; empty without a plan
-    guards: tuple[Any, ...] = ()  # S conditions: queries, or the objects of another plan
+    guards: tuple[Any, ...] = ()  # S conditions: queries, or other objects that ``str`` can show
     reasons: tuple[str, ...] = ()  # S texts: a plan step's comment, or the skill as originally written
     target_poses: tuple[TargetPose | None, ...] = ()  # S; None for a skill that is not scripted
     pixels: NDArray[np.uint8] | None = None  # T×H×W×C, the input images of the policy or the evaluator

@@ -215,7 +215,7 @@ class RerunLogger(Logger):
         self.flush(timeout)
         self._service_shutdown = True
         atexit.unregister(self.shutdown)
-        # If the disk is full, Rerun's writer thread has ended, and Rerun may wait for it forever, here and at exit.
+        # If the disk is full, Rerun's writer thread has ended. Rerun may wait forever for the thread, here and at exit.
         closing = threading.Thread(target=self.experiment.disconnect, daemon=True)
         closing.start()
         wait = FLUSH_SECONDS if timeout is None else timeout

@@ -17,7 +17,7 @@ from lw_torchrl.record.page import Page
 OVERVIEW = "overview"
 """The name of the overview tab and of the overview's entity."""
 TITLES = {kind: kind.title() for kind in ("metrics", "histograms", "videos")} | {"hparams": "Hyperparameters"}
-"""Titles of tabs without episodes, by the first part of their entity paths; no episode may have such a name."""
+"""Titles of tabs without episodes, by the first part of the entity path, which no episode may have as its name."""
 ON_METRIC_TIMELINE = {"metrics", "histograms"}
 _PROPERTY = "layout"
 

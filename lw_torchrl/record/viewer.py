@@ -53,7 +53,7 @@ def open_viewer(
         path: a .rrd file, a folder of .rrd files, or several of these; the viewer lists all recordings and opens the
             last one.
         screenshot: a PNG file to write instead of opening a window.
-        window_size: width and height of the window or screenshot, "1400x900" points.
+        window_size: width and height of the window or screenshot in points, such as "1400x900".
         step: the time step to open at; None for an episode's first success or failure, or the last step of a training
             run.
         episode: the tab to open, by title ("Metrics") or episode name, in each recording that has it; None opens the
@@ -101,7 +101,7 @@ def open_viewer(
                     files[-1] = folder / f"{number}.rrd"
                     ids = {"application_id": known.application_id, "recording_id": known.recording_id}
                     reader.stream().write_rrd(files[-1], **ids)
-                if tabs is not None and (own_front is not None or not reader.blueprints()):  # it was not closed
+                if tabs is not None and (own_front is not None or not reader.blueprints()):  # the file was not closed
                     layouts.append(folder / f"{number}.rbl")
                     tabs.blueprint(own_front).save(known.application_id, str(layouts[-1]))
         if len(unknown) == len(files):

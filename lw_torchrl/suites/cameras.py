@@ -50,7 +50,7 @@ def _no_open_gl(error: Exception) -> ImportError:
 
 
 _open: WeakSet[Cameras] = WeakSet()
-_processes: set[int] = set()  # IDs of this process and its parent processes, if a process opened OpenGL
+_processes: set[int] = set()  # IDs of processes that opened OpenGL: this one, or those it was forked from
 
 
 def _close_all() -> None:

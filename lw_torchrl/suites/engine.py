@@ -26,8 +26,8 @@ class EngineStep(NamedTuple):
 @runtime_checkable
 class Engine(Protocol):
     """A simulator of N parallel environments, called rows. To support camera images, an engine also implements
-    ``render`` as in :class:`~lw_torchrl.suites.cameras.SeenRows`; to support recordings of the scene, ``row_model`` and
-    ``poses``."""
+    ``render`` as in :class:`~lw_torchrl.suites.cameras.SeenRows`. To support recordings of the scene, it implements
+    ``row_model`` and ``poses``."""
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start an episode in each of ``rows`` and return the first observations (len(rows), D) float64. The initial

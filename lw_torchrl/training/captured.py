@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 PACKAGES = ("torch", "torchrl", "tensordict", "lw_torchrl")
-"""The packages whose modules can be captured, because they do not change Python attributes from step to step."""
+"""The packages whose modules can be captured, because the modules do not change Python attributes from step to step."""
 _WARM_UP = 2  # number of calls before the capture; the first call creates tables and the optimizer's state
 
 
@@ -23,7 +23,7 @@ def foreign_code(objects: Iterable[Any]) -> str:
     """
     for item in objects:
         for part in item.modules() if isinstance(item, nn.Module) else [item]:
-            function = getattr(part, "func", None)  # the function in a transform that wraps one
+            function = getattr(part, "func", None)  # not None for a transform that wraps a function
             codes: list[Any] = [type(part), function if hasattr(function, "__qualname__") else type(function)]
             for code in codes:
                 if code is not NoneType and code.__module__.partition(".")[0] not in PACKAGES:
@@ -37,7 +37,7 @@ def captures(device: torch.device) -> bool:
 
 
 class CapturedFunction:
-    """A function of a minibatch that runs as one CUDA graph on a CUDA device, and normally on other devices.
+    """A function of a minibatch that runs as one CUDA graph on a CUDA device, and without a graph elsewhere.
 
     A graph repeats the function's kernels on the same memory without running Python, so the function may depend only on
     the minibatch and on tensors. The first two calls run the function without a graph. If the second call waits for the
@@ -70,7 +70,7 @@ class CapturedFunction:
     def __call__(self, minibatch: Any, mode: Hashable = None) -> dict[str, Tensor]:
         """Run the function on a minibatch on the CPU or on the device.
 
-        A new ``mode``, or tensors with other keys, shapes or dtypes, discard the graph.
+        The graph is discarded if ``mode`` or the keys, shapes or dtypes of the minibatch change.
         """
         if self._module is None:
             return self._function(minibatch)

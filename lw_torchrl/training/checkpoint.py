@@ -36,9 +36,9 @@ def save_actor(actor: TensorDictModuleBase, path: AnyPath, **about: Any) -> None
 
     Args:
         actor: a policy built from this library's modules and custom modules. A custom module needs an attribute
-            ``config``, a dict of the keyword arguments of its constructor, as JSON.
+            ``config``, a JSON-serializable dict of the keyword arguments of its constructor.
         path: the file to write, by convention with the suffix ``.safetensors``.
-        **about: additional metadata, as JSON.
+        **about: additional JSON-serializable metadata.
 
     Raises:
         TypeError: a module has no ``config``; the message names the module.
@@ -289,8 +289,8 @@ class CheckpointFiles:
             write_tensors(self.checkpoint, {**_header(self.part), **description}, contents_of(part))
 
     def exist(self) -> bool:
-        """Return whether the training state exists; raise ValueError if only the policy exists, which training would
-        overwrite."""
+        """Return whether the training state exists; raise ValueError if only the policy exists, because training would
+        overwrite the policy."""
         if not self.state.exists() and self.checkpoint.exists():
             message = f"{str(self.checkpoint)!r} exists, but its training state {str(self.state)!r} does not"
             raise ValueError(f"checkpoint: {message}; {_ADVICE}")

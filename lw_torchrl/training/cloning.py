@@ -33,7 +33,7 @@ class BehavioralCloningConfig:
 
     Attributes:
         steps: number of minibatches.
-        batch_size: rows per minibatch; with ``TaskBalancedSampler(exact=True)``, a multiple of the number of tasks.
+        batch_size: rows per minibatch; a multiple of the number of tasks with ``TaskBalancedSampler(exact=True)``.
         learning_rate: initial learning rate.
         momentum: momentum of the optimizer "sgd".
         schedule: learning rate schedule, "cosine" (to 0) or "constant".
@@ -43,7 +43,7 @@ class BehavioralCloningConfig:
         seed: seed of the minibatches, and of random numbers in the buffer's transforms and in the actor.
         checkpoint_every: number of minibatches between checkpoints; the last minibatch always writes a checkpoint.
         qaf_anchor: weight of the cross entropy between a learned evaluator's answers and the exact answers. This loss
-            term keeps the answers true to the conditions' meaning while imitation trains the evaluator.
+            term keeps the answers close to the conditions' meaning while imitation trains the evaluator.
     """
 
     steps: Count = 8000
@@ -69,7 +69,7 @@ def bc_loss(actor: nn.Module, distance: str) -> BCLoss:
 
 
 class _Steps(NamedTuple):
-    mask: Tensor  # (T, S) bool, the plan steps that each task's plan has
+    mask: Tensor  # (T, S) bool, True for the plan steps that exist in each task's plan
 
 
 class EvaluatorAnchor:

@@ -95,7 +95,7 @@ class _PictureQueries:
         return TensorDict({task.task.name: torch.randint(len(task.observation), (each,)) for task in self.tasks})
 
     def rows(self, drawn: TensorDictBase) -> TensorDictBase:
-        """Return a nested TensorDict for each task, on the device of ``drawn``, a result of :meth:`draw`."""
+        """Return a nested TensorDict for each task, for a result of :meth:`draw` and on the device of that result."""
         batch = TensorDict()
         for number, (task, pixels, truth) in enumerate(zip(self.tasks, self.pixels, self.truths, strict=True)):
             rows, clauses = drawn[task.task.name], self.clauses[number]
@@ -121,7 +121,7 @@ class _PictureQueries:
 
     @staticmethod
     def loss(network: Any, batch: TensorDictBase, config: Any) -> Tensor:
-        """Return the mean over tasks of the weighted loss of the answers plus the loss of the objects' positions."""
+        """Return the weighted loss of the answers plus the loss of the objects' positions, averaged over tasks."""
         losses = []
         for states in batch.values():
             places, _ = network.places(states["pixels"], network.names.weight)
@@ -157,7 +157,7 @@ def _known_positions(queries: TaskQueries, names: tuple[str, ...]) -> tuple[Tens
 
 
 def _answer_weights(queries: TaskQueries) -> Tensor:
-    """Return weights (2, Q) float32 of each clause's false and true answers, to balance predicates and truth values."""
+    """Return weights (2, Q) float32 for a clause's false and true answers, to balance predicates and truth values."""
     true, predicates = queries.truth.double().mean(0), [clause.predicate for clause in queries.clauses]
     weights = torch.zeros(2, len(predicates))
     for predicate in {*predicates}:

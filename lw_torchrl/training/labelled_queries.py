@@ -33,8 +33,8 @@ class QueryEvaluatorConfig:
         learning_rate: initial learning rate, which decays to 0 on a cosine schedule.
         states_per_task: maximum number of training states per task, drawn from the rows of the task.
         every: use every N-th state of an episode; with pictures, N is the number of time steps between pictures.
-        held_out_states: fraction of each task's episodes whose states are held out; at least one episode is not.
-        held_out_pairs: fraction of the pairs of object names that are held out in all tasks; at least one pair is not.
+        held_out_states: fraction of each task's episodes whose states are held out, at most all episodes but one.
+        held_out_pairs: fraction of the pairs of object names that are held out in all tasks, at most all pairs but one.
         held_out_tasks: names of the held-out tasks, or the number of held-out tasks to draw.
         seed: seed for drawing the held-out splits, the training states and the minibatches.
     """
@@ -132,7 +132,7 @@ class LabelledQueries:
         if other := sorted({*ids.unique().tolist()} - {*known}):
             raise ValueError(f"tasks must include all tasks of the rows, but the task ids {other[:8]} are missing")
         present = [known[number] for number in ids.unique().tolist()]
-        if (pixels := rows.get("pixels", None)) is not None:  # check that all show the current state
+        if (pixels := rows.get("pixels", None)) is not None:  # check that all pictures show the current state
             hand, episode = (rows.get(key) for key in ("observation", ("collector", "traj_ids")))
             moved = hand[:, present[0].layout.positions[0]].diff(dim=0).norm(dim=-1) > _MOVED
             if any(torch.equal(pixels[row], pixels[row + 1]) for row in (moved & (episode.diff() == 0)).nonzero()):
@@ -146,7 +146,7 @@ class LabelledQueries:
         self.parts: dict[str, list[TaskQueries]] = {"training": [], "states": [], "queries": [], "tasks": []}
         for task in present:
             own, most = ids == task_id(task.name), config.states_per_task
-            # Skip negated clauses: their answers are the opposite, so there would be nothing more to learn.
+            # Skip negated clauses: their answers are the opposite of other answers, so they teach nothing more.
             clauses = [clause for clause in base_clauses(task, tuple(PREDICATES)) if not clause.negated]
             train = _at_most(most, (own & ~held_out).nonzero().flatten(), generator)
             test = _at_most(most, (own & held_out).nonzero().flatten(), generator)

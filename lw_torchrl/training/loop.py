@@ -49,7 +49,7 @@ def make_optimizer(
 
 
 def _rate_factor(config: Any, step: int) -> float:
-    """Return the fraction of the initial learning rate after ``step`` optimizer steps: a cosine to 0, or 1."""
+    """Return the learning rate after ``step`` optimizer steps as a fraction of the initial one: a cosine to 0, or 1."""
     if getattr(config, "schedule", "cosine") == "constant":
         return 1.0
     return 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
@@ -75,7 +75,7 @@ def _check_loss(losses: Tensor, step: int) -> None:
 
 @contextmanager
 def _interrupts_between_steps() -> Iterator[SimpleNamespace]:
-    """Record the first Ctrl-C (``requested``), and raise :class:`KeyboardInterrupt` at the end of the block.
+    """Record the first Ctrl-C as ``requested``, and raise :class:`KeyboardInterrupt` only at the end of the block.
 
     A second Ctrl-C (``insisted``) raises immediately. Nothing changes outside the main thread, or if SIGINT is ignored.
     """
@@ -119,10 +119,10 @@ class Training:
     """Base class for trainers. A subclass sets the attributes below and implements :meth:`losses`.
 
     Args:
-        config: hyperparameters: ``steps``, ``checkpoint_every``, ``learning_rate``, and optionally ``schedule``
+        config: hyperparameters ``steps``, ``checkpoint_every``, ``learning_rate``, and optionally ``schedule``
             ("cosine" or "constant") and ``max_grad_norm``.
         checkpoint: the file to write the trained policy to, for example "mt10.safetensors". The training state is
-            written next to the policy ("mt10.training.safetensors"). If that file exists, training resumes from it.
+            written next to the policy ("mt10.training.safetensors"). Training resumes from an existing training state.
         evaluate: a function that returns numbers to log as ``evaluation/NAME``, such as success on held-out seeds.
         evaluate_every: call ``evaluate`` every N minibatches and after the last, with the networks in eval mode.
         logger: a TorchRL logger, which receives the mean losses of every 100 minibatches as ``train/NAME``.
@@ -180,8 +180,8 @@ class Training:
         self._captured: CapturedFunction | None = None
 
     def losses(self, batch: Any) -> Mapping[str, Tensor]:
-        """Return the loss terms of a minibatch, and other values to log, by name. Terms whose names begin with "loss"
-        are added."""
+        """Return the loss terms of a minibatch, and other values to log, by name. Values whose names begin with "loss"
+        are summed."""
         raise NotImplementedError(f"{type(self).__name__} must implement losses")
 
     def step(self) -> Tensor:
@@ -218,7 +218,7 @@ class Training:
         return only
 
     def batch(self, drawn: Any) -> Any:
-        """Return the minibatch for a result of :meth:`combined`, which must be on the device."""
+        """Return the minibatch for ``drawn``, the result of :meth:`combined` after a move to the device."""
         return self.minibatches[0].rows(drawn)
 
     def update(self, batch: Any) -> dict[str, Tensor]:
@@ -273,7 +273,7 @@ class Training:
         with lock, _interrupts_between_steps() as interrupt:
             with Progress(self.title, total, "step", initial=self.steps, show=self.progress) as bar:
                 if self.steps >= last:
-                    self.save()  # an earlier process may have been killed after writing the state, before the policy
+                    self.save()  # an earlier process may have been killed between writing the state and the policy
                 while self.steps < last and not interrupt.requested:
                     self.step()
                     bar.update()

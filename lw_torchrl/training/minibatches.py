@@ -37,7 +37,7 @@ class Minibatches:
 
     def __init__(self, source: Any, size: int, seed: int, device: torch.device = CPU) -> None:
         self.source, self.size, self.seed, self.step = source, size, seed, 0
-        # The source from which `draw` draws only indices.
+        # The source if `draw` draws only indices from it, otherwise None.
         self.indexed: Any = source if hasattr(source, "draw") else IndexedReplay.of(source, device)
         if hasattr(source, "set_rng"):
             source.set_rng(torch.default_generator)  # the generator that `drawing` seeds
@@ -55,7 +55,7 @@ class Minibatches:
         return self.source.sample(self.size) if self.indexed is None else self.indexed.draw(self.size)
 
     def rows(self, drawn: Any) -> Any:
-        """Return the minibatch for a result of :meth:`draw`, which must be on the device."""
+        """Return the minibatch for ``drawn``, the result of :meth:`draw` after a move to the device."""
         return drawn if self.indexed is None else self.indexed.rows(drawn)
 
     def state_dict(self) -> dict[str, Any]:
@@ -69,7 +69,7 @@ class Minibatches:
 
 
 class IndexedReplay:
-    """A wrapper of a replay buffer with rows on a GPU, which first draws indices on the CPU and then gathers rows."""
+    """A wrapper that draws indices on the CPU, and then gathers the rows of a replay buffer on a GPU."""
 
     def __init__(self, replay: TensorDictReplayBuffer) -> None:
         self.replay, self._given = replay, _GivenRows()
@@ -83,7 +83,7 @@ class IndexedReplay:
         return cls(source) if is_here and _draws_on_cpu(source) else None
 
     def draw(self, size: int) -> TensorDict:
-        """Draw the sampler's ``index`` and other information, (B,) each, on the CPU."""
+        """Draw ``index`` and the other values that the sampler returns, (B,) each, on the CPU."""
         sampler, storage = self.replay.sampler, self.replay.storage
         index, more = sampler.draw(storage, size) if isinstance(sampler, GroupSampler) else (storage.draw(size), {})
         return TensorDict({"index": index, **more}, [size])

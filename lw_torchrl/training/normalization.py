@@ -70,7 +70,7 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
 
 
 def share_contacts(module: nn.Module) -> None:
-    """Call :meth:`RoleFeatures.share` for all role features in a module or loss, after a change of their buffers.
+    """Call :meth:`RoleFeatures.share` for the role features in a module or loss, after their buffers were changed.
 
     If a loss holds several copies of a critic, the copies have separate buffers, so there is nothing to share.
     """

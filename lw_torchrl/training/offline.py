@@ -225,7 +225,7 @@ def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
     if ahead and len(replay) and "next" not in replay.storage[0].keys():
         raise ValueError("loss requires next observations, which replay lacks; open the buffer with label='executed'")
     gammas = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
-    expected = next(iter(gammas), getattr(replay, "gamma", None))  # None where ``next`` is one step ahead
+    expected = next(iter(gammas), getattr(replay, "gamma", None))  # None if ``next`` is one time step ahead
     if expected is None or loss.default_value_estimator is None:
         return
     gamma = getattr(loss.value_estimator, "gamma", None)

@@ -26,8 +26,8 @@ ACTIVE_WEIGHT = 0.01
 
 
 class PlanAugmentation(Transform):
-    """Base class for augmentations that depend on a row's active plan steps, whose attention is above 0.01. Using one
-    in an environment raises a :class:`TypeError`."""
+    """Base class for augmentations that depend on a row's active plan steps, those with attention above 0.01. In an
+    environment, they raise a :class:`TypeError`."""
 
     steps: Tensor
 
@@ -67,10 +67,10 @@ class PlanAugmentation(Transform):
 
 
 class SwapUnmentioned(PlanAugmentation):
-    """An augmentation that gives each object not mentioned by an active plan step its position in a random row.
+    """An augmentation that moves each object that no active plan step mentions to its position in a random row.
 
-    A plan step mentions an object, or the goal, if its condition or skill names it. For replay buffers, after a
-    :class:`QAFTransform`, which must see the unchanged scene.
+    A plan step mentions an object, or the goal, if its condition or skill names it. Use this class in a replay
+    buffer after a :class:`QAFTransform`, which must see the unchanged scene.
 
     Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); changes ``observation`` (B, D) and ``("next", "observation")`` in
     the same way. An object keeps its position if a step that is active in either observation mentions it. Draws from

@@ -84,7 +84,7 @@ class EpisodeTransform(Transform):
 class KeepsEnvState(EpisodeTransform):
     """Base class for transforms that save the environment's state in their own ``state_dict``.
 
-    TorchRL does not save this state, so a resumed Collector would run the same episodes again. After
+    TorchRL does not save this state, so a resumed Collector would otherwise repeat the same episodes. After
     ``load_state_dict``, reset the environment (``collector.reset()``).
     """
 

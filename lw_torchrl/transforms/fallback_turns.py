@@ -24,7 +24,7 @@ class _Rows(NamedTuple):
 
 
 class FallbackTurns(Transform):
-    """A transform that counts the turns of an episode, in which a plan alternates with its fallback plan.
+    """A transform that counts the turns of an episode. In these turns, a plan alternates with its fallback plan.
 
     Six turns form a cycle. In turns 0 and 3 the policy follows the plan, in turns 1 and 4 it releases the object, and
     in turns 2 and 5 it tries the two motions of the fallback plan. A turn ends when neither the hand nor an object has

@@ -1,4 +1,4 @@
-"""Transforms that write observations: camera pictures, the task's description, and the numbers of a layout."""
+"""Transforms that write observations: camera pictures, the task's description, and the observation of a layout."""
 
 from __future__ import annotations
 
@@ -114,9 +114,9 @@ class CameraTransform(KeepsEnvState):
 class LanguageInstruction(Transform):
     """A transform that writes the task description, such as "Push the puck to the target location.".
 
-    For environments and replay buffers. Reads ``task_id`` (B,) int64; writes ``language_instruction``, one string for
-    each row, which policies such as ``torchrl.modules.VLAWrapperBase`` read. Strings make an environment step 1.15 to
-    2.5 times slower, so :class:`~lw_torchrl.LanguageWorldEnv` does not write them itself.
+    Works in environments and replay buffers. Reads ``task_id`` (B,) int64; writes ``language_instruction``, one string
+    for each row, which policies such as ``torchrl.modules.VLAWrapperBase`` read. Strings make an environment step 1.15
+    to 2.5 times slower, so :class:`~lw_torchrl.LanguageWorldEnv` does not write them itself.
 
     Args:
         tasks: the tasks whose descriptions are known, as for :class:`~lw_torchrl.LanguageWorldEnv`, or their plans;
@@ -185,7 +185,7 @@ class SuiteTransform(Transform):
         task: the task, whose layout has D numbers and A actions.
         observe: a function that maps the tensors of ``in_keys`` to (..., D) numbers in the layout's order and frame;
             the numbers of the previous time step are overwritten.
-        act: a function that maps an action of the layout (..., A) to one of the environment; None for the identity.
+        act: a function that maps an action of the layout (..., A) to an action of the environment; None for no change.
         in_keys: the keys that ``observe`` reads.
 
     Raises:

@@ -36,7 +36,7 @@ class _Number(NamedTuple):
 
 def read_truth(tensordict: TensorDictBase, keys: Keys, tables: PlanTables) -> tuple[Tensor, Tensor]:
     """Return truth values (..., S), and each task's row (...) int64 in ``tables``, from the keys of ``qaf`` and
-    ``task_id``; raise a :class:`ValueError` for other plans' truth, another shape, or soft truth outside [0, 1]."""
+    ``task_id``; raise a ValueError if the truth is of other plans, has a wrong shape, or is outside [0, 1]."""
     qaf, task_id = read(tensordict, keys)
     qaf, rows = answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), tables)
     if qaf.shape != (shape := (*rows.shape, tables.mask.shape[-1])):
@@ -53,12 +53,12 @@ def plan_program(plans: Plans) -> QueryProgram:
 
 
 def latches_of_rows(program: QueryProgram, observation: Tensor, task_id: Tensor, trajectory: Tensor) -> Tensor:
-    """Compute the latches (R, L) bool in all rows of whole episodes.
+    """Compute the latches (R, L) bool of all rows of complete episodes.
 
     Args:
         program: the program of the plans' conditions.
         observation, task_id: (R, D) float and (R,) int64, the rows of consecutive episodes in the order of time.
-        trajectory: (R,) int64, a number for each row that changes where a new episode begins.
+        trajectory: (R,) int64, a number that changes wherever a new episode begins.
     """
     latches = torch.zeros(len(task_id), program.num_latches, dtype=torch.bool, device=observation.device)
     is_first = torch.ones(len(task_id), dtype=torch.bool, device=observation.device)
@@ -73,7 +73,7 @@ def latches_of_rows(program: QueryProgram, observation: Tensor, task_id: Tensor,
 
 
 def truth_of_episode(plans: Plans, steps: TensorDictBase) -> Tensor:
-    """Return the truth (T, S) bool of the plans' conditions, which may refer to earlier steps, in one episode (T,)."""
+    """Evaluate the plans' conditions, which may refer to earlier steps, in an episode (T,); return (T, S) bool."""
     program, observation, task_id = plan_program(plans), steps.get("observation"), steps.get("task_id")
     if not program.num_latches:
         return program(observation, task_id)
@@ -212,8 +212,8 @@ class QAFTransform(KeepsEnvState):
 class CorruptQAF(EpisodeTransform):
     """A transform that makes the answers in ``qaf`` outdated or wrong, to simulate slow or unreliable condition checks.
 
-    For environments, after a :class:`QAFTransform`. Reads ``qaf`` (B, S) bool, or float in [0, 1], ``task_id`` (B,) and
-    ``episode`` (B,) int64, and ``qaf_plan`` (B,) int64 if present; changes only ``qaf``:
+    Use it in an environment, after a :class:`QAFTransform`. Reads ``qaf`` (B, S) bool, or float in [0, 1], ``task_id``
+    and ``episode`` (B,) int64, and ``qaf_plan`` (B,) int64 if present; changes only ``qaf``:
 
     - **every, delay** (outdated): at time step t of the episode (0 at the reset), a row has the answers of time step
       every · ⌊max(t - delay, 0) / every⌋;

@@ -66,7 +66,7 @@ def random_rotations(number: int, device: torch.device | None = None) -> Tensor:
 class RandomYaw(PlanAugmentation):
     """An augmentation that rotates the positions and actions of each row by a random angle about the vertical axis.
 
-    For replay buffers, after a :class:`QAFTransform`, which must see the original scene: "left of" has a direction.
+    Use it in a replay buffer, after a :class:`QAFTransform`: conditions such as "left of" need the original scene.
 
     Changes ``observation`` (B, 39), ``action`` (B, 4), and, if present, ``expert_action``, ``unclipped_action``
     (B, 4) and ``("next", "observation")``, all float32. Writes the angle in radians, ``observation_yaw`` (B,) float32,
@@ -142,8 +142,8 @@ class RandomYaw(PlanAugmentation):
         return torch.where(self._all_true(tensordict, "free"), any_angle, angle)
 
     def _all_true(self, tensordict: TensorDictBase, name: str) -> Tensor:
-        """Return whether the conditions of one or more plan steps are true, and ``name`` is true for all these steps,
-        (B,) bool; ``name`` is a table (T, S) bool."""
+        """Return (B,) bool: whether the condition of any plan step is true, and the table ``name`` (T, S) bool is true
+        for every such step."""
         qaf, rows, steps = self.answers(tensordict, ["qaf", "task_id"])
         true = (qaf > 0.5) & steps
         return (self.table(name, rows.device)[rows] | ~true).all(-1) & true.any(-1)

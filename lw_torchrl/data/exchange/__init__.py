@@ -69,7 +69,7 @@ def export_dataset(
 
     :func:`import_dataset` restores the dataset bit-exactly. docs/data.md lists the columns of both formats: the
     dataset's columns, the task's name and description, the plan's text, and ``plan_holds`` (R, S) bool, the conditions
-    of the plan that hold in each row (time step). In "lerobot", pictures of :func:`add_pictures` become videos.
+    of the plan that hold in each row (time step). "lerobot" stores pictures of :func:`add_pictures` as videos.
 
     Args:
         root: the dataset's folder, written by :func:`collect_demonstrations`.

@@ -47,7 +47,7 @@ class ImportedTable(EpisodeRows):
     notes: Sequence[str]
 
     def explain(self, name: str) -> str:
-        """Return the end of a warning about a missing column if a column in the files has the wrong size, else ""."""
+        """Return text to append to a missing-column warning if the files have this column in a wrong size, else ""."""
         return f" ({self.unfit[name]} does not have one number per row)" if name in self.unfit else ""
 
 
@@ -80,8 +80,8 @@ def read_files(source: Path, is_hdf5: bool, layout: Layout) -> ImportedTable:
 def find_ends(table: ImportedTable, suite: Suite, episode_length: int | None) -> ImportedTable:
     """Return the table with the ends of all episodes. If the files do not state the ends, derive them and add a note.
 
-    A row that is marked as done, terminated or truncated ends an episode, unless marked rows are consecutive: such
-    marks describe a state, such as success. Without usable marks, episodes have ``episode_length`` steps, or the
+    A row that is marked as done, terminated or truncated ends an episode, unless marked rows are consecutive, because
+    such marks describe a state, such as success. Without usable marks, episodes have ``episode_length`` steps, or the
     suite's maximum.
     """
     if table.ends_known:
@@ -156,7 +156,7 @@ def complete_columns(table: ImportedTable, suite: Suite) -> tuple[dict[str, Arra
     """Return all columns of a dataset, built from an imported table, and a note on each column that the table lacks."""
     rows, lacking = table.rows, [*table.notes]
     used = ["observation", "action", "next_observation", "reward_dense"]
-    used.append("success" if "success" in table.columns else "reward_sparse")  # other columns must not cause errors
+    used.append("success" if "success" in table.columns else "reward_sparse")  # unused columns must not cause errors
     columns: dict[str, Array] = {}
     for name in [name for name in used if name in table.columns]:
         column = table.columns[name].reshape((rows, -1) if name in WIDE else rows)

@@ -160,7 +160,7 @@ def _pixel_format(pictures: Pictures) -> str:
 
 
 def _video_feature(pictures: Pictures, fps: int) -> dict[str, Any]:
-    """Return the entry for a video column in LeRobot's info.json."""
+    """Return the description of a video column for LeRobot's info.json."""
     height, width, _ = pictures.shape
     info: dict[str, Any] = {"video.height": height, "video.width": width, "video.channels": 3, "video.fps": fps}
     info |= {"video.codec": "h264", "video.pix_fmt": _pixel_format(pictures)}

@@ -2,7 +2,7 @@
 
 data/main_data.hdf5    a group for each episode: observations (T + 1, 39), actions (T, 4), dense rewards, terminations
                        and truncations (T,), and infos/... (T + 1, ...). success and reward_sparse describe the
-                       preceding step (zero in the first row); all others the following step (zero in the last row)
+                       preceding step (zero in the first row), all other infos the following step (zero in the last)
 data/metadata.json     Minari's description, and the metadata of the lw_torchrl dataset
 """
 

@@ -7,7 +7,7 @@ compares the declared sizes with the files' sizes, reads only the columns that a
     out/table.json          the episodes' lengths and possible task names, and the names of the columns; or an error
     out/COLUMN.npy          a column (R, ...) of numbers
 
-It imports only NumPy, pyarrow and h5py, and no other module of the package, so that it starts quickly.
+The script imports only NumPy, pyarrow and h5py, and no other module of the package, so that it starts quickly.
 
 LeRobot      meta/info.json, meta/tasks.jsonl or .parquet, meta/episodes.jsonl or meta/episodes/*/*.parquet (all
              optional), and parquet files in data/ with episode_index, frame_index, task_index and the columns
@@ -127,7 +127,7 @@ class Files:
     def save(self, out: Path) -> None:
         """Write the columns and the description."""
         for name, column in self.columns.items():
-            with (out / f"{name}.npy").open("wb") as file:  # np.save raises errors that do not name limits
+            with (out / f"{name}.npy").open("wb") as file:  # the errors of np.save do not state their cause
                 column = np.ascontiguousarray(column)
                 np.lib.format.write_array_header_2_0(file, np.lib.format.header_data_from_array_1_0(column))
                 file.write(column.data)
@@ -185,7 +185,7 @@ def read_parquet(source: Path, files: Files) -> None:
             except Refused:
                 if chosen.get(name, "action") in ("action", "observation"):
                     raise
-                files.unfit[chosen.pop(name)] = name  # a column that can be missing
+                files.unfit[chosen.pop(name)] = name  # an optional column
                 del parts[name]
     read = {name: np.concatenate(arrays) for name, arrays in parts.items()}
     read |= {name: _whole(name, read[name]) for name in index}
@@ -254,7 +254,7 @@ def _find_episodes(
         episode = file
     elif sum(lengths := [each.get("length", 0) for _, each in sorted(listed.items())]) == rows:
         episode = np.repeat(sorted(listed), lengths)
-    else:  # where the task changes or the frames start again, a new episode must begin
+    else:  # an episode must begin wherever the task changes or the frame numbers start again
         restarts = frame == frame.min()
         files.ends_known = "frame_index" in read and bool(restarts.sum() > 1)
         marks = [read["task_index"]] if "task_index" in read else [read[name] for name in texts]
@@ -287,7 +287,7 @@ def _find_episodes(
 
 
 def _same(column: Array) -> Array:
-    """Compare the value of each row, except the first, with the previous row; return whether they are equal."""
+    """Return, for each row except the first, whether its value equals the value of the previous row."""
     return np.asarray(column[1:] == column[:-1])
 
 
@@ -444,7 +444,7 @@ def _texts_of_items(group: Any) -> Iterator[str]:
 
 
 def _plain_texts(value: Any) -> Iterator[str]:
-    """Yield a text or whole number as an unquoted string; of an array, only the first element."""
+    """Yield a text or whole number as an unquoted string; for an array, yield only its first element."""
     if isinstance(value, (list, np.ndarray)):
         value = np.asarray(value, dtype=object).flatten()[0] if np.size(value) else None
     if isinstance(value, bytes):

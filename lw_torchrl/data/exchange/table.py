@@ -25,7 +25,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
         name: ("next", name) for name in ("reward_sparse", "reward_dense", "success", "done", "terminated", "truncated")
     },
 }
-"""A mapping from the columns of an exported table to the keys of a dataset that cannot be derived from the episodes."""
+"""A mapping from the columns of an exported table to keys of a dataset, except keys that the episodes determine."""
 WIDE = ("observation", "next_observation", "action", "expert_action", "unclipped_action")  # other columns are scalars
 HOLDS = "plan_holds"  # (R, S) bool: which conditions of the plan hold in each row; padded with False
 ABOUT = "lw_torchrl"  # the name of the dataset's metadata in exported files

@@ -35,12 +35,12 @@ from lw_torchrl.language.tasks import TASKS, task_id
 from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.suites.suite import Suite, find_suite
 
-MARGIN = 0.3  # a clear lead of one replacement, as a fraction of the task's failed episodes
-# These replacements were tried only after a wrong environment, observation, answer or action was measured.
+MARGIN = 0.3  # lead that makes a replacement decisive, as a fraction of the task's failed episodes
+# These are tried only if a measured observation, answer or action is wrong, or if the engine is a function.
 _FACTS = ("environment", "perception", "query", "wrapper")
 _PARTS = ("skill", "gripper", "actuation", "policy", "plan")  # in order of precedence
-_SEEN = 0.01  # metres by which an observation must be wrong to count if correcting it does not help
-_CLEAR = 0.1  # root mean square by which executed actions must differ from the commanded ones
+_SEEN = 0.01  # larger errors of an observation, in metres, count as a cause even if correcting them does not help
+_CLEAR = 0.1  # smaller changes of the policy's action (root mean square), by wrapper or environment, are not a cause
 
 
 @typed
@@ -154,7 +154,7 @@ def _failed(rollouts: Iterable[Any], plans: Plans) -> dict[EpisodeId, TensorDict
 
 
 def _verdict(case: FailedEpisode, reruns: Reruns, shares: Mapping[str, float], seed: int, length: int) -> Failure:
-    """Return an episode's failure with its cause, as determined by the re-runs, and the finding that shows it."""
+    """Return the failure of an episode, with the cause that the re-runs show and the finding that supports it."""
     record: dict[str, Any] = {"task": case.task, "seed": seed, "episode": case.plain.episode, "shares": dict(shares)}
     if case.fails_elsewhere or (case.differs is not None and shares["nothing"] >= MARGIN):
         at = length - 1 if case.differs is None else int(case.differs.values["at"])
@@ -202,10 +202,10 @@ def _blame(case: FailedEpisode, cause: Cause, scripts: Scripts, compared: Depart
 
 
 def _evidence(case: FailedEpisode, scripts: Scripts, compared: Departures | None) -> dict[str, float]:
-    """Return numbers, by name, that were measured in the states or show why a success may not be due to the plan.
+    """Return numbers by name: measurements in the states, and reasons why a success may not be due to the plan.
 
     "expert_steps" is the number of plan steps without a scripted skill, in which Meta-World's expert acts;
-    "generic_plan" is 1 if the policy follows the generic plan, "not_understood" if no step of the plan could be parsed.
+    "generic_plan" is 1 if the policy follows the generic plan; "not_understood" is 1 if no plan step could be parsed.
     """
     plan, unscripted = case.plan, scripts.skills[case.task].count(None)
     uncovered = (~case.truth.any(-1))[-case.late :]
@@ -224,7 +224,7 @@ def _evidence(case: FailedEpisode, scripts: Scripts, compared: Departures | None
 def _wrong_motion(
     case: FailedEpisode, kind: str, gripper: Tensor, by: str | None
 ) -> tuple[Cause, Finding, int | None] | None:
-    """Return the cause of a wrong gripper or hand motion, the finding, and the plan step (None for several steps)."""
+    """Return the cause of a wrong gripper or hand motion, the finding, and the plan step (None for several)."""
     by_kind = {"wrapped action": case.wrapped, "executed action": case.executed, "policy's action": case.scripted}
     if (motion := by_kind[kind]) is None:
         return None

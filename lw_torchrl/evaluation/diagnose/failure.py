@@ -1,4 +1,4 @@
-"""Failure: why one episode failed, as typed data and in English: a cause, a finding, and the results of re-runs."""
+"""Failure: the reason why one episode failed, as typed data (cause, finding, results of re-runs) and in English."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _ReplacementName = Annotated[str, Is[lambda name: name in REPLACEMENTS]]
 @typed_fields
 @dataclass(frozen=True)
 class Finding:
-    """What the re-run of a failed episode shows: a kind in data/causes.toml, and the values in the kind's text."""
+    """A fact that the re-run of a failed episode shows: a kind in data/causes.toml, and values for the kind's text."""
 
     kind: _FindingKind
     values: Mapping[str, str | Finite]
@@ -132,7 +132,7 @@ class Failure:
         return "no part of the policy could be replaced"
 
     def _text_of_success(self, name: str) -> str:
-        """Name the replacement that helps and the fractions of failed episodes that re-runs fix, in a clause."""
+        """Return a clause that names the successful replacement and the fractions of episodes that re-runs fix."""
         expert = self.evidence.get("expert_steps", 0.0) if name in _SCRIPTED else 0.0
         others = f" (Meta-World's expert in {counted(int(expert), 'step')} without a scripted skill)" if expert else ""
         shares = [f"this fixes {self.shares.get(name, 1.0):.0%} of the task's failed episodes"]

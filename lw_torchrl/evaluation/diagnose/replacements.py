@@ -26,7 +26,7 @@ from lw_torchrl.transforms.augmentation import ACTIVE_WEIGHT
 
 EpisodeId = tuple[str, int]  # task and episode index
 TRUE_OBSERVATION = "true_observation"  # the environment's observation, before any transform or module changes it
-MEASURED = "measured"  # the key of what Control records
+MEASURED = "measured"  # the key under which Control records observations, answers and actions
 _REST = ScriptedSkill("", GRIPPER, gain=(0.0, 0.0, 0.0))  # stands in for a plan step without a scripted skill
 
 
@@ -48,7 +48,7 @@ class Scripts:
         return torch.tensor([skill is not None for skill in self.skills[task]])
 
     def distance(self, task: str, step: int, observation: Tensor) -> float | None:
-        """Return the metres between what a plan step's skill moves and its target in a state (D,); None without one."""
+        """Return the metres from a plan step's moved object to its target in a state (D,); None without a script."""
         if (skill := self.skills[task][step]) is None:
             return None
         positions = self.plans[task].definition.positions(observation)
@@ -57,7 +57,7 @@ class Scripts:
 
 
 def chosen(truth: Tensor, number: Tensor | int) -> Tensor:
-    """Return the first plan step (...) that is true in ``truth`` (..., S) bool, or the last of ``number`` steps."""
+    """Return the first plan step (...) whose condition holds in ``truth`` (..., S) bool, or else ``number`` - 1."""
     return torch.where(truth.any(-1), truth.int().argmax(-1), number - 1)
 
 
@@ -81,20 +81,20 @@ def attended(weights: Tensor, steps: Tensor) -> Tensor:
 
 
 class Control(nn.Module):
-    """Wrap a policy to record its observations and actions, and optionally replace parts of it by trusted parts.
+    """A wrapper that records a policy's observations and actions, and can replace parts of the policy by trusted parts.
 
-    Writes below the key "measured": "true", the environment's observation; "shown", the observation that the policy's
-    innermost module receives; "answered", the answers that the policy acts on; "decided", the innermost module's
-    action; "commanded", the policy's action, which differs if a wrapper changes it; and "scripted", the action of the
-    scripted skills, mixed by the policy's attention weights (NaN if no plan step is active or the active one has no
-    scripted skill).
+    Each call adds a nested TensorDict "measured" with six entries. "true" is the environment's observation, and "shown"
+    is the observation that the innermost module (the policy inside all wrappers) receives. "answered" holds the answers
+    that the policy acts on. "decided" is the innermost module's action, and "commanded" is the action of the whole
+    policy, including changes by wrappers. "scripted" is the sum of the scripted skills' actions, weighted by the
+    policy's attention; NaN if no plan step is active or the active plan step has no scripted skill.
 
     Args:
         actor: the policy.
         scripts: the scripted skills of the plans that the policy follows.
-        correct: show the true observation to the innermost module.
-        answer: replace the answers of query evaluators inside the policy by the environment's exact answers.
-        unwrap: execute the innermost module's action.
+        correct: pass the true observation to the innermost module.
+        answer: replace the answers of query evaluators inside the policy with the environment's exact answers.
+        unwrap: return the innermost module's action instead of the whole policy's.
         part: the part of the action that scripts take over: "motion", "gripper" or "all"; None for no part. If no plan
             step is active, the policy's own action is kept. If the active step has no scripted skill, the expert acts.
         steps: for each (task, episode), the only plan step in which scripts take over; None for all plan steps.
@@ -137,7 +137,7 @@ class Control(nn.Module):
         tensordict.set(MEASURED, {**measured, "commanded": action.clone()})
         replaced = step >= 0
         if self._steps is not None:
-            # Scripts take control where the plan step to replace in the row's episode has a noticeable weight.
+            # Scripts take control in the rows in which the plan step to replace has a noticeable weight.
             episodes = zip(task.tolist(), seen.get("episode").tolist(), strict=True)
             own = torch.tensor([self._steps.get(which, -1) for which in episodes], device=action.device)
             weight = weights.gather(-1, own.clamp(min=0).unsqueeze(-1)).squeeze(-1)
@@ -196,7 +196,7 @@ class Control(nn.Module):
     def _is_innermost(self, module: nn.Module) -> bool:
         """Return whether a module is an innermost policy, which maps an observation to an action.
 
-        Modules of this package count as innermost, others only if they contain no other such module.
+        A policy from this package always counts as innermost, any other policy only if no policy is inside it.
         """
         if module not in self._innermost:
             inner = [] if type(module).__module__.startswith("lw_torchrl.") else [*module.modules()][1:]

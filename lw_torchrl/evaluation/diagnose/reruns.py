@@ -35,7 +35,7 @@ from lw_torchrl.modules.policy import plans_of, with_plans
 from lw_torchrl.modules.query_evaluator import evaluators_of
 
 _EXACT = 1e-4  # smaller differences between observations or between actions are rounding
-_AFTER = 5  # number of states in which a difference between two simulations may grow
+_AFTER = 5  # a difference is measured over this number of states, because it may grow at first
 
 
 def difference(steps: TensorDictBase, again: TensorDictBase) -> Finding | None:
@@ -88,7 +88,7 @@ class Reruns:
     progress: bool
 
     def __post_init__(self) -> None:
-        self.trusted = self._with_reference()  # the settings for the reference plans that differ from the policy's
+        self.trusted = self._with_reference()  # settings with the reference plans that differ from the policy's
         self.gripper = gripper_of(self.settings.scripts.plans)
 
     def run(self, rollouts: Mapping[EpisodeId, TensorDictBase]) -> list[FailedEpisode]:
@@ -96,7 +96,7 @@ class Reruns:
         plain = self._run("nothing replaced", list(rollouts), self.settings)
         cases = [self._measure(steps, plain[which]) for which, steps in rollouts.items()]
         left = self._try_measured([case for case in cases if not case.fails_elsewhere])
-        # Where wrong answers are a cause for certain, but not the only one, only pairs can show the other cause.
+        # If wrong answers are certainly a cause, but exact answers do not suffice, only pairs can show the other cause.
         misled = [case for case in left if "query" in case.results and case.answers_wrong >= OFTEN_WRONG]
         left = [case for case in left if case not in misled]
         self._try("no noise", left if self.settings.noise_scale else [], noise_scale=0.0)
@@ -117,7 +117,7 @@ class Reruns:
         return cases
 
     def _try_measured(self, cases: list[FailedEpisode]) -> list[FailedEpisode]:
-        """Re-run episodes with trusted engines, observations, answers or actions; return those that still fail."""
+        """Re-run episodes with trusted engines, observations, answers or actions; return the cases that still fail."""
         evaluator = self.settings.evaluator
         if callable(self.settings.engine):
             self._try("environment", [c for c in cases if c.task in self.env_options["suite"].tasks], engine=None)
@@ -138,9 +138,9 @@ class Reruns:
         return _unfixed(cases, "perception", "query", "wrapper")
 
     def _try_scripts(self, cases: list[FailedEpisode]) -> None:
-        """Re-run episodes with scripts for all actions and, where this helps, for the parts that act differently."""
+        """Re-run episodes with scripts for all actions and, if they then succeed, with scripts for single parts."""
         hand, every = ~self.gripper, self.gripper | True
-        # Without any difference, scripts would change nothing.
+        # Skip episodes in which the policy already acts exactly like the scripts.
         cases = [c for c in cases if not c.scripted.wanted.isfinite().all() or c.unlike(every) > 0.0]
         again = self._try("policy", cases, control={"part": "all"})
         cases = [case for case in cases if case.is_fixed("policy")]
@@ -171,7 +171,7 @@ class Reruns:
         return again
 
     def _measure(self, rollout: TensorDictBase, plain: FinishedEpisode) -> FailedEpisode:
-        """Compare the policy's observations with the true ones, and its actions with those that were executed."""
+        """Compare the policy's observations with the true observations, and its actions with the executed actions."""
         measured, plan = plain.steps.get(MEASURED), self.settings.scripts.plans[plain.task]
         motions: dict[str, Any] = self._motions(plain, plan)
         for name in ("wrapped", "executed"):
@@ -202,7 +202,7 @@ class Reruns:
         }
 
     def _with_reference(self) -> Settings | None:
-        """Return settings with scripts, policy and evaluator for the reference plans that differ from the policy's."""
+        """Return settings for reference plans that differ from the policy's; None if none differ or can be followed."""
         reference, settings = self.reference, self.settings
         tasks = [] if reference is None else reference.differences(settings.scripts.plans)
         if reference is None or not (different := [reference[task] for task in tasks if task in self.tasks]):
@@ -245,7 +245,7 @@ class Reruns:
 
 
 def shares_of(cases: Sequence[FailedEpisode]) -> dict[str, float]:
-    """Return, for each replacement, the fraction of failed episodes that succeed with it, where it was tried."""
+    """Return, for each replacement, the fraction that succeeds among the failed episodes on which it was tried."""
     tried = {"nothing": [case.plain.first_success is not None for case in cases]}
     for case in cases:
         for name, episode in case.results.items():

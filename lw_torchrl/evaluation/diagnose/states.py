@@ -18,18 +18,18 @@ from lw_torchrl.transforms.qaf import truth_of_episode
 _BRIEF = 5  # with fewer states, a plan step's error is not measured
 _SAME = 0.02  # actions that differ by less than this count as equal
 _HALF = 0.5  # the fraction of an error that a fault may leave unexplained
-_DELAYS = 26  # delays up to this number of time steps are tried
-_LATE = 100  # number of last states of a failed episode, in which the episode made no progress
+_DELAYS = 26  # only delays shorter than this number of time steps are tried
+_LATE = 100  # number of final states of a failed episode that are assumed to show no progress
 _AHEAD, _STILL = 10, 0.01  # the hand stands still if it moves less than 1 cm in 10 states
-_AWAY = 25  # longest interruption (in states) of a visit to a plan step, so that two alternating steps are one visit
+_AWAY = 25  # a visit to a plan step may be interrupted for up to 25 states, for example if two plan steps alternate
 _OTHER_STATES = ("other states", "other first state")
 _SAME_STATE = 1e-6  # smaller differences between two simulations of a state are rounding
-WRONG, OFTEN_WRONG = 0.01, 0.5  # fractions of states with wrong answers that may be, and certainly are, a cause
+WRONG, OFTEN_WRONG = 0.01, 0.5  # wrong answers in these fractions of states are a possible and a certain cause
 OTHER = 0.3  # actions that differ by more than this on any axis serve different purposes
 
 
 class Motion(NamedTuple):
-    """The right actions and the actual actions in T states, and the active plan steps."""
+    """The right and the actual action, and the active plan step, in each of T states."""
 
     wanted: Tensor  # (T, A) float32, the right actions; NaN where unknown
     done: Tensor  # (T, A) float32, the actual actions
@@ -40,7 +40,7 @@ class Motion(NamedTuple):
         return Motion(*(torch.cat(both) for both in zip(self, other, strict=True)))
 
     def of(self, entries: Tensor) -> Motion:
-        """Select action entries with the mask ``entries`` (A,) bool, and only states whose right action is known."""
+        """Select the action entries ``entries`` (A,) bool, in states with an active step and a known right action."""
         known = (self.active >= 0) & self.wanted.isfinite().all(-1)
         return Motion(self.wanted[known][:, entries], self.done[known][:, entries], self.active[known])
 
@@ -54,10 +54,10 @@ class Motion(NamedTuple):
         return {step: _rms(self.done - self.wanted, here) for step, here in steps.items() if here.sum() >= _BRIEF}
 
     def predicted(self, where: Tensor) -> tuple[str, Tensor]:
-        """Return the simplest fault that explains the error in the states ``where`` (T,) bool, and its actions (T, A).
+        """Return the name of the simplest fault that fits the states ``where`` (T,) bool, and predicted actions (T, A).
 
-        Each fault is fitted to these states by least squares: a constant, a factor for each axis, a shift, a delay of
-        whole steps, or a linear map of all axes. The name is "irregular" if no fault explains half of the error.
+        Each fault (a constant, a factor for each axis, a shift, a delay of whole time steps, or a linear map of all
+        axes) is fitted to these states by least squares. The name is "irregular" if none explains half of the error.
         """
         wanted, done = self.wanted, self.done
         square = wanted[where].square().sum(0).clamp(min=1e-6)
@@ -76,12 +76,12 @@ class Motion(NamedTuple):
         return name if left[name] < _HALF * _rms(done - wanted, where) else "irregular", faults[name]
 
     def extent(self, exact: bool = False) -> tuple[bool | None, int, str]:
-        """Return whether the fault is in all plan steps, the plan step with the largest error, and the fault's shape.
+        """Return ``in_all`` (whether all plan steps have the fault), ``worst`` (a plan step) and the fault's name.
 
-        The fault is estimated in the plan step with the largest error, and predicts the errors of the other plan steps.
-        The first value is True if the fault explains these errors or if they are about as large, False if they are
-        smaller than predicted, and None if neither is clear. With ``exact``, the fault is the only possible error, so
-        any error in another plan step gives True.
+        ``worst`` is the plan step with the largest error; -1 if no plan step was active in 5 states. The fault is
+        fitted to this step. ``in_all`` is True if the fault also explains the errors in the other plan steps, or if
+        they are about as large; False if they are smaller than the fault predicts; and None if neither is clear. With
+        ``exact``, only the fault can cause errors, so any error in another plan step gives True.
         """
         errors = self.errors()
         if not errors:
@@ -93,14 +93,14 @@ class Motion(NamedTuple):
         if not others.any():
             return None, worst, name
         measured, expected = _rms(self.done - self.wanted, others), _rms(fault - self.wanted, others)
-        # A policy that equals the scripts in many states has no other errors either.
+        # If the actions are exact in many states, the policy has no errors except the fault.
         equal = float(((self.done - self.wanted).abs().amax(-1) < 1e-5).float().mean()) > 0.1
         if (exact and measured > 1e-3) or (equal and measured > _SAME):
             return True, worst, name
         unexplained = _rms(self.done - fault, others)
         if min(errors.values()) > _SAME and name == "irregular" and min(errors.values()) > _HALF * errors[worst]:
             return True, worst, name
-        if measured <= _SAME:  # the other plan steps are executed exactly
+        if measured <= _SAME:  # the other plan steps are executed almost exactly
             shows = expected > 2 * measured + 0.25 * _SAME
             return (False if shows else None if measured == 0.0 else unexplained < measured), worst, name
         if unexplained < _HALF * measured or (name != "irregular" and unexplained < 0.8 * measured):
@@ -124,13 +124,13 @@ class FailedEpisode:
     truth: Tensor  # (T, S) bool, the exact answers
     answers: Tensor  # (T, S) bool, the answers that the policy acted on
     active: Tensor  # (T,) int64, the plan step with the largest weight; -1 where all weights are equal
-    scripted: Motion  # scripted and commanded actions
-    wrapped: Motion | None = None  # decided and commanded actions, if they differ
-    executed: Motion | None = None  # commanded and executed actions, if they differ
+    scripted: Motion  # the actions of the scripts and of the policy
+    wrapped: Motion | None = None  # the actions of the innermost module and of the policy, if they differ
+    executed: Motion | None = None  # the policy's actions with noise and the executed actions, if they differ
     misled: Finding | None = None
     differs: Finding | None = None  # the first difference between the rollout and the plain re-run
-    step: int | None = None  # the plan step in which a script was tried
-    # The re-run with each replacement that was tried if the episode then succeeded, otherwise None.
+    step: int | None = None  # the only plan step in which a script replaces the policy, if one is tried
+    # For each replacement that was tried: the re-run if it succeeded, otherwise None.
     results: dict[str, MendedEpisode | None] = field(default_factory=dict)
 
     @property
@@ -158,14 +158,14 @@ class FailedEpisode:
 
     @property
     def fails_elsewhere(self) -> bool:
-        """Whether the rollout's environment differs from the suite's, or the plain re-run succeeds."""
+        """Whether the environment differs between the rollout and the plain re-run, or the plain re-run succeeds."""
         return self.environment_differs or self.plain.first_success is not None
 
     def is_fixed(self, *names: str) -> bool:
         return any(self.results.get(name) is not None for name in names)
 
     def unlike(self, entries: Tensor) -> float:
-        """Return the largest difference, over plan steps, between the policy's actions and the scripted actions."""
+        """Return the largest root-mean-square difference of a plan step between policy and scripts, in ``entries``."""
         return self.scripted.of(entries).error()
 
 
@@ -192,7 +192,7 @@ def exact_answers(plan: ConditionalPlan, steps: TensorDictBase) -> Tensor:
 
 
 def last_stay_start(states: Tensor) -> int:
-    """Return the first state of the last visit in ``states`` (T,) bool; gaps of up to 25 states do not end a visit."""
+    """Return where the last visit begins in the mask ``states`` (T,) bool; a visit may have gaps of up to 25 states."""
     places = states.nonzero().flatten()
     if not len(places):
         return len(states) - 1
@@ -213,7 +213,7 @@ def stall_step(failed: FailedEpisode, step: int) -> int:
 
 
 def last_active_step(failed: FailedEpisode) -> int:
-    """Return the plan step that was active in most of the last 100 states."""
+    """Return the plan step that was active most often in the last 100 states, or the last step if none was active."""
     late = failed.active[-failed.late :]
     return int(torch.bincount(late[late >= 0]).argmax()) if (late >= 0).any() else len(failed.plan.steps) - 1
 
@@ -229,7 +229,7 @@ def blame_step(failed: FailedEpisode, scripts: Scripts, step: int) -> Blame:
 
 
 def blame_answers(failed: FailedEpisode) -> Blame:
-    """Blame the plan step with most wrong answers; if some of them changed the chosen plan step, count only these."""
+    """Blame the plan step with the most wrong answers, counting only those that changed the chosen step, if any did."""
     wrong, number = failed.answers != failed.truth, len(failed.plan.steps)
     changes = chosen(failed.answers, number) != chosen(failed.truth, number)
     matter = wrong & changes.unsqueeze(-1) if changes.any() else wrong
@@ -242,7 +242,7 @@ def blame_answers(failed: FailedEpisode) -> Blame:
 
 
 def blame_plan(failed: FailedEpisode, compared: Departures) -> Blame:
-    """Blame the plan step in which the reference requests a different action most often, in the last states if any."""
+    """Blame the plan step that departs from the reference most often in the last states, or else in all states."""
     reference, departs, ours, theirs = compared
     of = failed.late if departs[-failed.late :].any() else len(departs)
     where = departs.clone()

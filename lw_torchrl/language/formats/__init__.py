@@ -14,7 +14,7 @@ from lw_torchrl.language.plans import ConditionalPlan
 
 
 def _check_format(name: str, format: Any) -> PlanFormat:
-    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):  # the name is also a folder's name
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):  # also the name of a folder
         raise ValueError(f"name of a plan format must be lower case like 'basic_py', got {shown(name)}")
     return check_value(f"plan format {name!r}", format, PlanFormat)
 

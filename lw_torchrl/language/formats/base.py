@@ -19,7 +19,7 @@ from lw_torchrl.language.tasks import Task
 
 @dataclass(frozen=True)
 class Style:
-    """A style of writing plans, which determines the content of each step."""
+    """A writing style for plans. It determines the content of each step."""
 
     explains: bool = False  # list the steps first, and write a reason before each clause
     goals: bool = False  # write a skill as the state to reach, if the step has a goal
@@ -37,12 +37,12 @@ class PlanFormat:
     encode: Callable[[ConditionalPlan], str]
     read: Callable[[str], Reading]  # parses any text into clauses; never raises
     prompt: Callable[[Sequence[ConditionalPlan], Task, Sequence[str]], str]
-    style: Style = Style()  # used for models that are constrained to a JSON Schema
+    style: Style = Style()  # also the style of plans in JSON, for models whose answers must follow a JSON Schema
 
 
 @dataclass(frozen=True)
 class Styled:
-    """A function whose last argument is a style; unlike a partial function, it can be pickled and compared."""
+    """A function with its last argument, a style, already bound. Instances can be pickled and compared for equality."""
 
     function: Callable[..., str]
     style: Style
@@ -63,7 +63,7 @@ _ITEM = re.compile(r"\s*\[?(\d{1,4})[.):\]]\s*(\S.*)")
 
 @dataclass(frozen=True)
 class Note:
-    """A note on a line (1-based) that was dropped or changed while parsing a text."""
+    """A note about a line that was dropped or changed while a text was parsed. Line numbers start at 1."""
 
     line: int
     text: str
@@ -87,7 +87,7 @@ class Clause:
 class Section:
     """A section of a text, with the clauses for one task."""
 
-    task: str  # the task's name; "" for the text before the first name, which may continue the prompt
+    task: str  # the task's name; "" for text before the first name (it may continue the prompt)
     line: int  # number of the section's first line, from 1
     clauses: list[Clause] = field(default_factory=list)  # in the order of the text
     listed: str = ""  # the list of steps before the clauses, "1. first  2. second"
@@ -168,12 +168,12 @@ _QUESTION = re.compile(r"(?:(?:is|are|does|has|do)\s+)?(.+?)\s*\?", re.IGNORECAS
 
 
 def is_near(distance: float, unit: str = "m") -> bool:
-    """Return whether an object at this distance is about as far as "near" says (4 cm)."""
+    """Return whether a distance threshold is from 0.5 to 10 cm, and can thus be read as "near" (4 cm)."""
     return 0.005 <= distance * _METRES.get(unit, 1.0) <= 0.1
 
 
 def statement(text: str) -> str:
-    """Return a condition without the notation of code or of a question.
+    """Convert a condition that is written as code or as a question to plain words.
 
     "IsNear(gripper, mug)" and "Is the gripper near the mug?" give "gripper near mug" and "the gripper near the mug".
     """
@@ -195,7 +195,7 @@ def statement(text: str) -> str:
 
 
 def command(text: str) -> str:
-    """Return an action without the notation of code: "MoveTo(mug)" gives "move to mug"."""
+    """Convert an action that is written as code to plain words: "MoveTo(mug)" gives "move to mug"."""
     call = _CALL.fullmatch(text)
     return " ".join([*words_of(call[1]), *call[2].replace(",", " ").split()]) if call else text
 

@@ -1,4 +1,4 @@
-"""The clauses of prose: where a sentence is cut, which connective begins each clause, and what the clause says."""
+"""Split prose into clauses, and find the connective and the kind of each clause (condition, action, state, ...)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PARTS |= {f"connective_{role}": _any(words) for role, words in _WORDS["connecti
 _PARTS |= {f"answer_{role}": _any(words) for role, words in _WORDS["answers"].items()}
 _RELATED = sorted([*RELATIONS, *({*WORDS["conditions"]} - {"on", "at"})], key=len, reverse=True)
 _PARTS["relation"] = _any(list(map(re.escape, _RELATED)))
-PATTERNS = {  # a part is written in angle brackets
+PATTERNS = {  # a name in angle brackets stands for an entry of _PARTS
     name: _compiled(re.sub(r"<(\w+)>", lambda part: _PARTS.get(part[1], part[0]), pattern))
     for name, pattern in _WORDS["patterns"].items()
 }
@@ -60,7 +60,7 @@ class Clause:
 
 
 def clauses(text: str) -> list[Clause]:
-    """Cut a line into clauses.
+    """Split a line into clauses.
 
     Example:
         >>> for clause in clauses("Once the gripper is near the mug and open, close it; otherwise, move above it."):
@@ -78,7 +78,7 @@ def clauses(text: str) -> list[Clause]:
             sentences[number] = sentences[number].replace(",", chr(0xE000))
     hidden = "".join(sentences)
     found, start = list[Clause](), 0
-    inner = _begin(hidden)  # after the connectives
+    inner = _begin(hidden)  # position after the connectives
     for match in PATTERNS["cut"].finditer(f"{hidden} "):
         before, rest = hidden[start : match.start()].translate(_SHOW), hidden[match.end() :][:400].translate(_SHOW)
         is_word = not match[0].strip()
@@ -97,7 +97,7 @@ _SHOW = {hidden: mark for mark, hidden in _HIDE.items()}
 
 
 def _begin(text: str) -> int:
-    """Return where a clause begins after its connectives."""
+    """Return the position in a clause after its connectives."""
     at = 0
     while match := _JOINT.match(text, at) or _LEAD.match(text, at):
         at = match.end()
@@ -107,7 +107,7 @@ def _begin(text: str) -> int:
 
 
 def _is_cut(before: str, rest: str) -> bool:
-    """Return whether a clause begins at a word within a phrase."""
+    """Return whether a new clause begins between two parts of a phrase that no punctuation separates."""
     joint = _JOINT.match(rest)
     inner = rest[joint.end() :] if joint else rest
     while joint and (lead := _LEAD.match(inner)):
@@ -139,7 +139,7 @@ def _is_cut(before: str, rest: str) -> bool:
 
 
 def _clause(text: str, stop: str) -> Iterator[Clause]:
-    """Yield the clauses of an uncut part of a line: leading words such as "otherwise" or "yes", then the rest."""
+    """Yield the clauses of a piece of a line: leading words such as "otherwise" or "yes", then the rest."""
     joint = ""
     while text:
         if match := _JOINT.match(text):
@@ -171,7 +171,7 @@ def _clause(text: str, stop: str) -> Iterator[Clause]:
 
 
 def _subordinate(role: str, word: str, text: str, joint: str, stop: str) -> Iterator[Clause]:
-    """Yield a clause after a connective, and an action without a comma before it ("if it is open close it")."""
+    """Yield the clause after a connective, and an action that follows without a comma ("if it is open close it")."""
     gerund = re.match(r"(\w+ing)\b(.*)", text)
     if word in ("after", "before", "once", "when", "while") and gerund and base_verb(gerund[1]):
         kind = word if word in ("after", "before") else "say"
@@ -190,7 +190,7 @@ def _subordinate(role: str, word: str, text: str, joint: str, stop: str) -> Iter
 
 
 def _action_at(text: str) -> int:
-    """Return where an action begins after a condition without a comma; 0 if there is none."""
+    """Return the position of an action that follows a condition without a comma; 0 if there is none."""
     for gap in re.finditer(r"\s+", text[:400]):
         before, rest = text[: gap.start()], text[gap.end() :]
         is_verb_first = PATTERNS["verb_first"].match(rest) and _is_verb(rest.split())
@@ -202,7 +202,7 @@ def _action_at(text: str) -> int:
 
 
 def _main(text: str, stop: str) -> Clause:
-    """Return a clause without a connective."""
+    """Convert a text without a connective to a clause of the right kind."""
     if PATTERNS["repeat"].match(text):
         return Clause("say", text, "", stop)
     if match := PATTERNS["asks"].match(text):
@@ -241,7 +241,7 @@ def is_state(text: str) -> bool:
 
 
 def is_action(text: str) -> bool:
-    """Return whether an action begins a text, even after "and": not "open and near" or "lower than"."""
+    """Return whether a text begins with an action; "open and near" and "lower than" begin with an adjective."""
     words = action(text).lower().split()
     if not words or _IS_MODAL.match(text):
         return bool(words)
@@ -251,9 +251,9 @@ def is_action(text: str) -> bool:
 
 
 def action(text: str, is_certain: bool = False) -> str:
-    """Return "push it" for "push it", "the robot should push it", "it pushes it" and "it is pushed"; "" for others.
+    """Return "push it" for "push it", "the robot should push it", "it pushes it" and "it is pushed"; "" if no action.
 
-    Only if an action is certain, "the gripper is closed" gives "close the gripper"; otherwise it is a state.
+    With ``is_certain``, "the gripper is closed" gives "close the gripper"; by default, this text is not an action.
     """
     is_told = False
     while match := _LEAD.match(text) or _JOINT.match(text) or PATTERNS["should"].match(text):

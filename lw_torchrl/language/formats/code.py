@@ -44,8 +44,8 @@ class CodeReading(Reading):
         """Parse lines of code, which are numbered from ``start`` + 1, and cut off the code after a syntax error."""
         first = next((number for number, line in enumerate(lines) if _START.match(line)), len(lines))
         lines[:first] = [""] * first
-        lines = [re.sub(r"^(\s*)pass (?=if\b.+\belse\b)", r"\1None ", line) for line in lines]  # as models write it
-        head = "if True:" if first < len(lines) and lines[first][0] == " " else ""  # an additional line 0
+        lines = [re.sub(r"^(\s*)pass (?=if\b.+\belse\b)", r"\1None ", line) for line in lines]  # a common mistake
+        head = "if True:" if first < len(lines) and lines[first][0] == " " else ""  # becomes line 0
         for _ in range(_MOST_REPAIRS):
             try:
                 with warnings.catch_warnings():
@@ -89,7 +89,7 @@ class Module:
             for node in ast.walk(module)
             if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant)
         }
-        # The names of the fields of records, such as ``Rule(when, then)``.
+        # The field names of records, such as ``Rule(when, then)``.
         self.fields = {
             name: [name_of(each.target) for each in body if isinstance(each, ast.AnnAssign)]
             for name, body in classes.items()
@@ -155,7 +155,7 @@ class _Scope(Expressions):
         return node, after
 
     def statement(self, node: ast.stmt) -> list[Node]:
-        """Return the parts that a statement adds to a block."""
+        """Return the nodes that a statement adds to a program."""
         match node:
             case ast.Expr(value=value):
                 return self.expression(value)
@@ -210,7 +210,7 @@ class _Scope(Expressions):
         return tests, rest
 
     def choice(self, tests: Sequence[tuple[Expression, list[ast.stmt]]], otherwise: list[ast.stmt]) -> Node:
-        """Return nested branches for (condition, statements) pairs; assigned variables come to depend on conditions."""
+        """Convert (condition, statements) pairs to nested branches; variables assigned in them become conditional."""
         branches = [(condition, *self.branch(body)) for condition, body in tests]
         last = self.block(otherwise) if otherwise else None
         result: Node | None = last
@@ -241,7 +241,7 @@ class _Scope(Expressions):
         return as_expression(f"{ast.unparse(subject)} matches {ast.unparse(pattern)}")
 
     def rounds(self, node: ast.stmt, target: ast.expr, iterated: ast.expr, body: list[ast.stmt]) -> list[Node]:
-        """Unroll a loop over literals; of any other loop, return the body once."""
+        """Unroll a loop over literals; for any other loop, return the body once."""
         items = self.value(iterated)
         names = [each.id for each in getattr(target, "elts", [target]) if isinstance(each, ast.Name)]
         if not isinstance(items, list) or not names:
@@ -294,7 +294,7 @@ class _Scope(Expressions):
         return [] if text is None or isinstance(text, Name) else [action(text, node.lineno)]
 
     def first(self, values: Sequence[ast.expr]) -> Node:
-        """Return the first action of "grasp(...) or lift(...) or 'wait'": a helper that returns None is passed over."""
+        """Return the first action of "grasp(...) or lift(...) or 'wait'", and skip any helper that returns None."""
         result: Node = Block()
         for each in reversed(values):
             text = self.value(each)

@@ -1,4 +1,4 @@
-"""The expressions of Python code: the texts, conditions and values that they stand for."""
+"""Convert expressions in Python code to texts, conditions and other values."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 PYTHON = PROGRAM_WORDS["python"]
 _RELATIONS = [*PROGRAM_WORDS["prepositions"], "of", "aligned"]  # the last words of relations
-_MOST_INLINED = 500  # maximum number of inlined calls and unrolled rounds, which bounds the time
+_MOST_INLINED = 500  # maximum number of inlined calls and unrolled rounds, to bound the time
 
 
 class Expressions:
-    """The expressions of a function, with the values of its variables."""
+    """A converter of the expressions in a function, with the values of the function's variables."""
 
     def __init__(self, module: Module, values: dict[str, Value], roots: Collection[str] = (), end: str = "") -> None:
         self.module, self.values, self.roots = module, values, roots
@@ -56,13 +56,13 @@ class Expressions:
         return (self.words(node.value) or "") if isinstance(node, ast.Attribute) else ""
 
     def arguments(self, node: ast.Call) -> tuple[list[Text], dict[str, Text]]:
-        """Return the words of a call's arguments and of its keyword arguments."""
+        """Return the words of a call's positional arguments, and those of its keyword arguments by name."""
         words = [text for each in node.args if (text := self.words(each)) is not None]
         pairs = [(each.arg, self.words(each.value)) for each in node.keywords if each.arg]
         return words, {name: text for name, text in pairs if text is not None}
 
     def inner(self, node: ast.Call, name: str) -> Self | None:
-        """Return the scope of a called helper function; None if the function calls itself."""
+        """Return the scope of a called helper function; None if it calls itself or too many calls are inlined."""
         if name in self.module.stack or not self.count(1):
             self.left_out(node, "a function that calls itself" if name in self.module.stack else "too many calls")
             return None
@@ -140,7 +140,7 @@ class Expressions:
         return node.value if isinstance(node, ast.Constant) else self.words(node)
 
     def part(self, node: ast.Attribute | ast.Subscript) -> Value:
-        """Return an entry of a table or record, the value of a property, or else the words of ``puck.position``."""
+        """Return an entry of a table or record, the value of a property, or else the words of ``env.puck``."""
         owner = self.value(node.value)
         if isinstance(node, ast.Subscript):
             if isinstance(node.slice, ast.Slice):
@@ -157,7 +157,7 @@ class Expressions:
         return Name(words) if words and isinstance(words, str) else words or None
 
     def result(self, node: ast.Call) -> Value:
-        """Return the result of a call: of a helper, a function of Python, a table's ``get``, or a question."""
+        """Return the result of calling a helper, a Python built-in, a table's ``get``, or a check of the scene."""
         if name := self.module.helper(node):
             return self.called(node, name)
         if fields := self.module.fields.get(name_of(node.func)):

@@ -21,7 +21,7 @@ class Choice:
     condition: Expression
     then: Text
     otherwise: Text
-    count: int = field(init=False)  # of strings
+    count: int = field(init=False)  # number of possible strings
 
     def __post_init__(self) -> None:
         count = sum(each.count if isinstance(each, Choice) else 1 for each in (self.then, self.otherwise))
@@ -36,7 +36,7 @@ class Name(str):
 
 @dataclass(frozen=True)
 class Distance:
-    """The distance between two objects (in the plane for ``hand[:2] - puck[:2]``), and the relation if it is small."""
+    """The distance between two objects (horizontal for ``hand[:2] - puck[:2]``), and the relation if it is small."""
 
     first: Text
     second: Text
@@ -48,7 +48,7 @@ Value: TypeAlias = "Expression | Text | Distance | ast.Lambda | list[Value] | di
 
 
 def joined(parts: Sequence[Text], gap: str = " ") -> Text:
-    """Join texts; a text that depends on a condition makes the result depend on it."""
+    """Join texts. If one of them depends on a condition, so does the result."""
     for number, part in enumerate(parts):
         if isinstance(part, Choice):
             both = (joined([*parts[:number], each, *parts[number + 1 :]], gap) for each in (part.then, part.otherwise))
@@ -59,7 +59,7 @@ def joined(parts: Sequence[Text], gap: str = " ") -> Text:
 
 
 def each_text(text: Text, function: Callable[[str], Any], join: Callable[[Expression, Any, Any], Any]) -> Any:
-    """Apply a function to each string that a text can be, and join the results by the conditions."""
+    """Apply a function to each possible string of a text; ``join`` combines the results of both cases."""
     if isinstance(text, Choice):
         return join(text.condition, *(each_text(part, function, join) for part in (text.then, text.otherwise)))
     return function(text)
@@ -98,7 +98,7 @@ def constant(value: object) -> Expression | None:
 
 
 def chosen(condition: Expression, then: Value, otherwise: Value) -> Value:
-    """Return the value of a variable after a branch."""
+    """Return the value that a variable has after an ``if`` statement."""
     # A function that returns a text only in one branch returns None, an empty text, in the other.
     then, otherwise = (
         "" if one == FALSE and isinstance(other, str | Choice) else one

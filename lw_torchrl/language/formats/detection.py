@@ -1,4 +1,4 @@
-"""Which reader fits a text, and which of its sections is the plan for the task."""
+"""Choose the reader that fits a text, and the section that holds the plan for the task."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ _CONTROL_WORDS = re.compile(r"\b(?:otherwise|or else|else,|unless)\b|\bgo (?:on 
 
 
 _IT = r"(?:when|if|while|once|unless|otherwise,? if) it (?:is|isn't)\b"
-# Lines that are keys in YAML, but begin with a condition about another line, or are sentences after a label.
+# Lines that look like keys in YAML, but are conditions about an earlier line, or sentences after a label.
 _PRONOUN = re.compile(
     rf"^[ \t]*(?:[-*] )?(?:{_IT}[^:\n]*:|[a-z][\w ]{{0,40}}: (?:the|if|when|unless|once)\b[^\"'{{}}\n]*"
     r" (?:if|unless|when|once) (?:it|the)\b)",
     re.IGNORECASE | re.MULTILINE,
 )
-# Conditions about "it": the sentence reader knows what the line before is about.
+# Conditions about "it": only the sentence reader knows which object the line before is about.
 _ABOUT_IT = re.compile(rf"^[^\w\n]{{0,20}}(?:\d+[^\w\n]{{1,9}})?{_IT}", re.IGNORECASE | re.MULTILINE)
 
 
@@ -73,7 +73,7 @@ def read_any(text: str, mapper: StepMapper, read: _Reader | None) -> tuple[Readi
         is_about_it = _ABOUT_IT.search(own) is not None
         is_published = bool(first[1].task and first[1].clauses) and not first[0].notes
         is_free = read is None and is_prose and not (is_published and _CONTROL_WORDS.search(own) is None)
-        # In code with functions for other tasks only, prose is a comment.
+        # If code has functions for other tasks only, prose in it is a comment.
         is_comment = is_prose and any(part.task and part.clauses for pair in empty[:-1] for part in pair[0].sections)
         if len(group) > 1 and not is_comment and (is_free or _has_control(*first, own)):
             other = _with_clauses(group[1], own, mapper, any_name=read is None)
@@ -148,7 +148,7 @@ def _expression(mapper: StepMapper, leaf: Any) -> Expression:
 
 
 def _kept(section: Section, mapper: StepMapper | None = None) -> int:
-    """Return how many clauses of a section can be active; with a mapper, unknown conditions are never true."""
+    """Return how many clauses of a section can be active. With a mapper, unknown conditions count as never true."""
 
     def can_be_true(each: str | Expression) -> bool:
         return each != FALSE and not (mapper and isinstance(each, str) and mapper.query(each).query is None)
@@ -194,5 +194,5 @@ def section_notes(reading: Reading, section: Section, task: Task) -> list[Note]:
 
 
 def _names(name: str, task: Task) -> bool:
-    """Return whether a name is the task's name, up to case and punctuation."""
+    """Return whether a name is the task's name, ignoring case and punctuation."""
     return re.sub(r"[^a-z0-9]", "", name.lower()) == re.sub(r"[-/]", "", task.name)

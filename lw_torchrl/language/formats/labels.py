@@ -1,4 +1,4 @@
-"""Labels in prose: those of the parts of a rule ("Condition:", "Action:"), and those above notes ("Constraints:")."""
+"""Labels in prose, for the parts of a rule ("Condition:", "Action:") and for notes ("Constraints:")."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _ASIDES = ("comment", "name")
 class _Rule:
     """A rule, and how its labels are written."""
 
-    parts: dict[str, str] = field(default_factory=dict)  # "test", "act" and "else" to the text
-    lines: dict[int, str] = field(default_factory=dict)  # number of a line to its last part
+    parts: dict[str, str] = field(default_factory=dict)  # the texts by part ("test", "act" or "else")
+    lines: dict[int, str] = field(default_factory=dict)  # the last part in each line, by line number
     above: int = -1  # number of the line above the rule
-    is_marked: bool = False  # whether no YAML has such labels
+    is_marked: bool = False  # whether its labels cannot be keys in YAML
     places: set[tuple[str, int, int]] = field(default_factory=set)  # bullet, indent, and number of the line above
 
     @property
@@ -50,9 +50,9 @@ class _Rule:
 
 
 def without_asides(text: str, notes: list[Note]) -> str:
-    """Remove the notes and constraints below such labels if a rule remains; note each line. Line numbers stay the same.
+    """Remove notes and constraints with their labels if a rule remains. Append a note on each line; keep line numbers.
 
-    A list below "Rules:" is also removed if it has no condition, and rules stand above.
+    A list below "Rules:" is also removed if the list has no condition and other rules precede it.
 
     Example:
         >>> without_asides("If the gripper is open, close it.\\n\\nNote: close it slowly.", notes := []).strip()
@@ -87,7 +87,7 @@ def without_asides(text: str, notes: list[Note]) -> str:
 def labelled_rules(text: str) -> str:
     """Rewrite each rule whose condition and action have labels as a sentence. The number of lines stays the same.
 
-    Objects in YAML have keys like these labels, so labels without emphasis or a number must repeat.
+    Keys in YAML look like these labels, so labels without emphasis or a number only count if they repeat.
 
     Example:
         >>> print(labelled_rules("**Condition:** the gripper is open\\n**Action:** close the gripper").strip())
@@ -122,7 +122,7 @@ def labelled_rules(text: str) -> str:
 
 
 def _rules(lines: list[str]) -> Iterator[_Rule]:
-    """Yield the rules with labels."""
+    """Yield the rules whose parts have labels."""
     rule, first, last, above, document, is_near = _Rule(), "", "", -1, -1, True
     for number, line in enumerate([*lines, "#"]):
         fields = _fields(line)
@@ -166,7 +166,7 @@ def _rules(lines: list[str]) -> Iterator[_Rule]:
 
 
 def _fields(line: str) -> list[tuple[str, str, bool]]:
-    """Return the role, the value, and whether no YAML has such a label, of each label in a line with labels only."""
+    """Return (role, value, whether it cannot be YAML) for each label in a line; [] if the line has other text."""
     bullet, fields = BULLET.match(line), list[tuple[str, str, bool]]()
     pieces = _CUT.split(line[bullet.end() :] if bullet else line.lstrip())
     for piece in pieces:

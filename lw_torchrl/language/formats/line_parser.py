@@ -33,7 +33,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Repeat:
-    """The instruction to repeat the steps from a number on ("" for all steps) while a condition is true."""
+    """An instruction to repeat the steps from a given number on ("" for all steps) while a condition is true."""
 
     first: str
     condition: Expression
@@ -41,13 +41,13 @@ class Repeat:
 
 @dataclass
 class Open:
-    """A choice that "otherwise" or an answer may refer to."""
+    """A choice that a later "otherwise", "yes" or "no" may refer to."""
 
     choice: Choice
-    scopes: list[list[Part]]  # those that were open where the choice is
+    scopes: list[list[Part]]  # the scopes that are open where the choice begins
     is_question: bool = False
     is_exception: bool = False  # after "unless"
-    is_answered: bool = False  # with yes
+    is_answered: bool = False  # whether "yes" was read
 
     @property
     def is_last(self) -> bool:
@@ -59,19 +59,19 @@ Part = Node | Choice | Repeat
 
 
 class LineParser:
-    """The clauses of a line, which are added to the reading one after another."""
+    """A parser of one line, which adds the clauses of the line to the reading one after another."""
 
     def __init__(self, reading: SentenceReading, content: str, is_item: bool, is_head: bool, is_heading: bool) -> None:
         self.reading, self.refers, self.opens = reading, reading.refers, reading.opens
         self.is_item, self.is_head, self.is_heading = is_item, is_head, is_heading
         self.clauses, self.at = clauses(content), 0
         self.scopes = reading.scopes
-        self.start = self.kept = self.inner = len(self.scopes)  # scopes that remain after the line, "." and ";"
+        self.start = self.kept = self.inner = len(self.scopes)  # scopes to keep after the line, "." and ";"
         self.acts = list[tuple[list[Part], Part]]()  # the actions since the last condition, and their scopes
-        self.pending: Open | None = None  # the choice that "otherwise" extends
+        self.pending: Open | None = None  # the choice that a preceding "otherwise" extends
         self.before = Clause("say", "", stop=".")
         self.is_open = False  # whether no action follows the last condition
-        self.guards = list[tuple[Expression, list[Part]]]()  # the conditions of the line, and what they guard
+        self.guards = list[tuple[Expression, list[Part]]]()  # the conditions of the line, with the scopes they guard
 
     def read(self) -> None:
         while self.at < len(self.clauses):
@@ -99,11 +99,11 @@ class LineParser:
 
     @property
     def next(self) -> Clause:
-        """The clause after the current one; an empty one at the end of the line."""
+        """The clause after the current one; an empty clause at the end of the line."""
         return self.clauses[self.at] if self.at < len(self.clauses) else Clause("say", "", stop=".")
 
     def ended(self, clause: Clause) -> None:
-        """Close the scopes of the sentence before, unless a clause refers to it."""
+        """Close the scopes of the previous sentence, unless this clause refers back to that sentence."""
         stop = self.before.stop
         if stop in (".", "!", ";") and self.before.kind not in _BACK:
             if stop == "." and self.before.kind in ("if", "unless") and self.is_open:
@@ -115,7 +115,7 @@ class LineParser:
                 del self.scopes[self.inner if stop == ";" else self.kept :]
 
     def is_in_sentence(self, *kinds: str) -> bool:
-        """Return whether a clause of one of these kinds follows in the sentence."""
+        """Return whether a clause of one of these kinds follows in the same sentence."""
         for before, clause in itertools.pairwise(self.clauses[self.at - 1 :]):
             if before.stop in _STOPS:
                 return False
@@ -135,7 +135,7 @@ class LineParser:
         return bool(self.acts) if clause.joint == "and" or not clause.joint else clause.joint == "then" and self.at > 1
 
     def may_be_action(self, clause: Clause) -> bool:
-        """Return whether a clause may begin with a verb that is unknown."""
+        """Return whether a clause may begin with an unknown verb."""
         first = clause.text.partition(" ")[0].lower()
         is_known = first in (*NO_SKILL, *_WORDS["looks"], *_WORDS["no_verbs"], "")
         is_known |= any(PATTERNS[name].match(clause.text) is not None for name in ("announces", "repeat", "relation"))
@@ -208,12 +208,12 @@ class LineParser:
         self.acts = []
 
     def opposes(self, scope: list[Part], test: Expression) -> bool:
-        """Return whether a condition denies the condition of a scope, or the reverse."""
+        """Return whether a condition is the opposite of the condition of a scope."""
         guard = next((each for each, body in self.guards if body is scope), test)
         return guard != test and str(guard).replace(" not ", " ") == str(test).replace(" not ", " ")
 
     def trail(self, test: Expression, is_exception: bool) -> None:
-        """Guard the last actions."""
+        """Guard the last actions with the condition after them."""
         choice = Choice([(test, [part for _, part in self.acts])])
         self.replace(self.acts, choice)
         self.opens.append(Open(choice, [*self.scopes], is_exception=is_exception))
@@ -230,7 +230,7 @@ class LineParser:
     # Words that refer to an earlier condition
 
     def open(self, answer: str = "", is_here: bool = False) -> Open | None:
-        """Return the innermost choice without "otherwise", or question without an answer, that is near enough."""
+        """Return the innermost choice without "otherwise", or question without an answer, that is still open here."""
         for each in reversed(self.opens):
             if is_here and len(each.scopes) != len(self.scopes):
                 continue
@@ -275,7 +275,7 @@ class LineParser:
         self.acts, self.pending = [], None
 
     def same(self, test: Expression) -> None:
-        """Add the condition of "if it is" or "if it isn't", which may be the opposite case of the choice before."""
+        """Add the condition of "if it is" or "if it isn't". It may be the opposite case of the previous choice."""
         if self.before.stop in (".", ";"):
             del self.scopes[self.inner if self.before.stop == ";" else self.kept :]
         above = self.open()
@@ -285,7 +285,7 @@ class LineParser:
         self.lead(test)
 
     def otherwise(self, clause: Clause) -> None:
-        """Continue the innermost choice without "otherwise"."""
+        """Add an "otherwise" branch to the innermost choice that has none."""
         acts = self.acts if clause.stop in (".", ";") or self.at == len(self.clauses) else []
         parts = [part for _, part in acts]
         place = next((number for number, part in enumerate(acts[0][0]) if part is parts[0]), 0) if acts else 0
@@ -313,7 +313,7 @@ class LineParser:
         self.acts, self.pending = [], above
 
     def siblings(self, above: Open) -> list[Choice]:
-        """Return the choices in a row up to one, which have no "otherwise"."""
+        """Return a choice and the choices directly before it that have no "otherwise"."""
         row = list[Choice]()
         for part in reversed(above.scopes[-1]):
             if isinstance(part, Choice) and part.otherwise is None:
@@ -347,7 +347,7 @@ class LineParser:
             self.pending = None
 
     def state(self, clause: Clause) -> None:
-        """Add a description of a case, for the clauses after it."""
+        """Use a description of the scene as the condition of the clauses after it, if it introduces a case."""
         end = self.at
         while end < len(self.clauses) and self.clauses[end - 1].stop in ("", ",") and self.clauses[end].kind == "state":
             end += 1
@@ -372,7 +372,7 @@ class LineParser:
             self.say(clause)
 
     def say(self, clause: Clause) -> None:
-        """Note a text that is not read; remember what it is about."""
+        """Append a note on a clause that is not part of the plan, and remember the objects that it mentions."""
         text = clause.text
         if self.at == 1 and clause.stop == ":" and role_of(text) == "comment":
             self.at = len(self.clauses)

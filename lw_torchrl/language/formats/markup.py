@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from lw_torchrl.language.formats.base import PROGRAM_WORDS
 from lw_torchrl.language.formats.phrases import is_noun
 
-_LONGEST = 2_000  # maximum length of a line to read (characters), which bounds the time
+_LONGEST = 2_000  # maximum length of a line to read (characters), to bound the time
 BULLET = re.compile(r"\s*(?:[-*•–+>①-⑳]|\(?\[?\d{1,3}[.)\]]|[a-z]\))\s+")
 WHEN = re.compile(
     r"(?:<[^<>]*>|[\"'`*]|#+ )*(?:(?:finally|then|next|first|lastly|and|or|else),?\s+)?"
@@ -29,7 +29,7 @@ _ROWS = re.compile(  # of tables in HTML and in reStructuredText
 
 
 def table_rules(text: str) -> str:
-    """Rewrite each row of a table of rules as a sentence, and each item of a list in HTML as a line.
+    """Rewrite each row of a table of rules as a sentence, and each item of an HTML list as a line.
 
     Example:
         >>> print(table_rules("| the gripper is open | `close the gripper` |"))
@@ -65,7 +65,7 @@ def sentences(line: str) -> Iterator[str]:
 
 
 def rule_sentence(condition: str, action: str) -> str:
-    """Return a bullet with a rule, from the condition and the action in a table or below labels."""
+    """Write a rule as a bullet, given the condition and the action from a table or from labels."""
     condition = re.sub(r"^\s*\(?(?:[a-z]|[ivx]{2,4}|\d+(?:\.\d+)+)[.)]\s+", "", condition, flags=re.IGNORECASE)
     condition = re.sub(r"^\W*(?:when|if|whenever)\s+", "", _bare(condition), flags=re.IGNORECASE)
     lead = re.match(r"(?:otherwise|else),?\s+if\s+", condition, re.IGNORECASE)
@@ -77,7 +77,7 @@ def rule_sentence(condition: str, action: str) -> str:
 
 
 def _bare(text: str) -> str:
-    """Remove Markdown's emphasis and code spans, and quotes."""
+    """Remove double quotes, and the marks of emphasis and code in Markdown and HTML."""
     return re.sub(
         r"\*\*|__?(?<!\w_)(?=\w)|(?<=\w)__?(?!\w)|[`\"]|</?(?:b|strong|code|em|i|li|ul|ol|p)>", "", text
     ).strip()

@@ -1,4 +1,4 @@
-"""What short texts say: a statement about the scene, a command, or a name of an object, a relation or a verb."""
+"""Classify short texts: statements about the scene, commands, and names of objects, relations and verbs."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def role_of(key: str) -> str:
 
 
 def is_aside(key: str) -> bool:
-    """Return whether the value of a key is not a part of the plan, such as that of "thoughts" and "example_2"."""
+    """Return whether a key, such as "thoughts" or "example_2", has a value that is not a part of the plan."""
     words = plain(key).rstrip("0123456789 ").split()
     return not {" ".join(words), *words[:1], *words[-1:]}.isdisjoint(PROGRAM_WORDS["asides"])
 
@@ -128,7 +128,7 @@ def truth_of(value: Any) -> bool | None:
 
 
 _COMPARATORS = frozenset().union(*(_WORDS[name] for name in ("equals", "differs", "near", "far")))
-_ANYTHING = ("object", "obj", "item", "thing", "entity")  # in the name of a skill, for an argument
+_ANYTHING = ("object", "obj", "item", "thing", "entity")  # placeholders for an argument in the name of a skill
 _ARTICLE = re.compile(r"\b(?:the|an?)\b")
 
 
@@ -139,7 +139,7 @@ def is_comparator(value: Any) -> bool:
 
 
 class Phrase(NamedTuple):
-    """The words of a value whose texts are names."""
+    """A condition or an action that was joined from names."""
 
     text: str
     verb: str = ""  # "" for a condition
@@ -147,11 +147,11 @@ class Phrase(NamedTuple):
 
 
 def join_phrase(value: Any, hint: str, names: Mapping[str, Any]) -> Phrase | None:
-    """Join names of objects, relations and verbs to a condition or an action; None if the value is something else.
+    """Join names of objects, relations and verbs into a condition or an action; return None for any other value.
 
     Args:
-        hint: "test" for a condition, "act" for an action, "" if only the content tells.
-        names: what the program's own names stand for.
+        hint: "test" for a condition, "act" for an action, "" to infer it from the content.
+        names: the definitions in the program, by name.
 
     Example:
         >>> join_phrase({"subject": "gripper", "relation": "near", "object": "mug"}, "", {}).text
@@ -301,7 +301,7 @@ def comparison_of(row: Mapping[Any, Any]) -> tuple[str, bool] | None:
 
 
 def _called(verb: str, texts: list[str]) -> str:
-    """Join the name of a skill with its arguments: "move gripper above" and "wall", or "push object to" and two."""
+    """Join a skill's name with its arguments: "move gripper above" and "wall", or "push object to" and two names."""
     first, *words = verb.split()
     texts = [text for text in texts if not {*text.removeprefix("to ").split()} <= {*words}]
     if texts and (place := next((number for number, word in enumerate(words) if word in _ANYTHING), -1)) >= 0:

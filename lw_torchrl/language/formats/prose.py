@@ -75,13 +75,13 @@ def _is_read(line: str) -> bool:
 class ProseReading(Reading):
     """A reader of plans in prose.
 
-    A clause is a bullet that begins with "When", "If" or the like. In a section without such bullets a clause is a
-    sentence "When C, the robot should S". Any other sentence becomes the reason of the next clause.
+    A clause is a bullet that begins with "When", "If" or the like. In a section without such bullets, a
+    clause is a sentence "When C, the robot should S". Any other sentence becomes the reason for the next clause.
     """
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.bulleted: dict[int, bool] = {}  # section number to whether the section's clauses are bullets
+        self.bulleted: dict[int, bool] = {}  # whether a section's clauses are bullets, by section number
         self.reason: list[str] = []
         self.listing = False
         for number, line in enumerate(table_rules(text).splitlines(), 1):

@@ -223,7 +223,7 @@ class PythonReading(Reading):
         self.is_outside = False
 
     def branch(self, number: int, indent: int, code: str, branch: re.Match[str]) -> None:
-        """Parse an ``if`` or ``else`` and a call on the same line."""
+        """Parse an ``if`` or ``else``, and the call on the same line if there is one."""
         condition, rest = (None, code[branch.end() :]) if branch[2] else self.condition(number, code, branch.end())
         if branch[2]:
             self.note_control(number, "'else' has no condition; the skills under it are left out")
@@ -303,7 +303,7 @@ def state_to_reach(place: str, named: dict[str, str]) -> tuple[str, str]:
 
 
 def _unquoted(strings: str) -> str:
-    """Return the content of adjacent string literals."""
+    """Join adjacent string literals, and return their content without quotes and escapes."""
     bodies = [literal.lstrip("fFrRbBuU")[1:-1] for literal in re.findall(_STRING, strings)]
     return " ".join("".join(re.sub(r"\\(.)", r"\1", body) for body in bodies).split())
 

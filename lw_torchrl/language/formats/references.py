@@ -1,4 +1,4 @@
-"""References in the conditions and actions of prose: what "it", "there", "open" alone or "once it is" stand for."""
+"""Resolve references such as "it", "there", a bare "open" and "once it is" in the conditions and actions of prose."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ class References:
     """The objects, the place and the condition that later words refer to."""
 
     subject: str = ""  # of the last condition
-    object: str = ""  # with which the last condition compares it
+    object: str = ""  # the other object of the last condition
     place: str = ""  # to which the last action leads
     held: str = ""
     aligned: str = ""  # "vertically aligned with the mug"
     last: Expression = TRUE  # the condition that "it is" repeats
-    names: dict[str, str] = field(default_factory=dict)  # the conditions that names stand for
+    names: dict[str, str] = field(default_factory=dict)  # the conditions that the text defines, by name
 
     def condition(self, text: str) -> Expression:
-        """Convert a condition in English."""
+        """Convert a condition in English to an expression, and resolve its references."""
         text = " ".join(text.split())
         for name, meaning in self.names.items():
             named = rf"\b(?:the )?{name}(?: (?:is|are) (?:met|true|satisfied)| holds| applies)?\b"
@@ -48,7 +48,7 @@ class References:
         return any(re.search(rf"\b{name}\b", text, re.IGNORECASE) for name in self.names)
 
     def _holding(self, text: str) -> str:
-        """Write "the mug is held" and "it has the mug" as "the gripper is holding the mug"."""
+        """Rewrite "the mug is held" and "it has the mug" as "the gripper is holding the mug"."""
         known = next((each for each in (self.held, self.subject, self.object) if each and "gripper" not in each), "it")
 
         def holding(match: re.Match[str]) -> str:
@@ -130,14 +130,14 @@ class References:
         return rest
 
     def acted(self, text: str) -> None:
-        """Remember the object of an action, to which "it" in the condition after the action refers."""
+        """Remember the object of an action, since "it" in a condition after the action refers to that object."""
         if match := PATTERNS["acted"].match(text):
             self.subject = match[1]
             others = PATTERNS["noun"].findall(text[match.end(1) :])
             self.object = others[-1] if others else self.object
 
     def action(self, text: str, is_first: bool) -> str:
-        """Replace "it" in an action, and complete "close"."""
+        """Replace "it" in an action, and add the object to a bare "close" or "open"."""
         subject = self.subject.replace("\\", "")
         if text.lower() in ("close", "open"):
             text += f" {subject or 'the gripper'}"
@@ -154,12 +154,12 @@ class References:
 
 
 def _plain(copula: str) -> str:
-    """Return "is" for "stays" and "is not" for "isn't"; "has been" stays."""
+    """Return "is" for "stays" and "is not" for "isn't"; leave "has been" unchanged."""
     return copula if copula.startswith("ha") else "is not" if copula.endswith("n't") else "is"
 
 
 def _explained(text: str) -> str:
-    """Replace what a parenthesis explains: "the puck is in the gripper (the gripper is near the puck and closed)"."""
+    """Replace words with their explanation: "the puck is in the gripper (the gripper is near the puck and closed)"."""
     text = re.sub(r"\s?\(((?!not\b|no\b|never\b)[^()]*)\)", lambda each: each[0] if _is_known(each[1]) else "", text)
     inside = re.search(r"\w\s*\(([^()]*)\)", text)
     if inside is None or re.search(r"\b(?:not|or|and|is|are|unless)$", text[: inside.start() + 1], re.IGNORECASE):

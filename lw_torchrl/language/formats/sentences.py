@@ -14,21 +14,21 @@ from lw_torchrl.language.formats.references import References
 from lw_torchrl.language.programs import Block, Branch, Label, Loop, Node, Sequence, actions_of
 from lw_torchrl.language.tasks import TASKS
 
-_LONGEST = 4_000  # characters of a line
+_LONGEST = 4_000  # maximum length of a line (characters)
 _REWRITINGS = [(re.compile(text, re.IGNORECASE), plain) for text, plain in PROGRAM_WORDS["prose"]["rewritings"]]
 
 
 class SentenceReading(Reading):
-    """A reader of instructions, which become one tree. Numbered steps run in turn, rules side by side."""
+    """A reader that converts instructions to one tree. Numbered steps run in sequence, and rules run concurrently."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.root: list[Part] = []
-        self.scopes = [self.root]  # the innermost list to which clauses are added
+        self.scopes = [self.root]  # the open lists; clauses are added to the last one
         self.refers = References()
         self.opens = list[Open]()
         self.step, self.line = 0, 1
-        self.has_jumps = False  # to later steps
+        self.has_jumps = False  # whether a step jumps to a later step
         self.is_case = False  # whether the line above only describes a case: "Case 1: the gripper is open."
         self.is_below = False  # whether the line above is an action for such a case
         self.levels = list[tuple[float, int]]()  # the indent of each line above, and the number of scopes at its start
@@ -63,7 +63,7 @@ class SentenceReading(Reading):
             self.sections.append(Section("", 1, tree=tree))
 
     def read(self, line: str, following: str, is_heading: bool) -> None:
-        """Add the clauses of a line, at the depth of its indent."""
+        """Add the clauses of a line, nested according to the line's indentation."""
         item, indent = PATTERNS["item"].match(line), float(_indent(line))
         self.is_below = self.is_case and not item
         if self.levels and (PATTERNS["reply"].match(line) or self.is_below):
@@ -89,10 +89,10 @@ class SentenceReading(Reading):
             LineParser(self, content.rstrip("." * self.is_case), is_item, is_head, is_heading).read()
             last = clauses(content)[-1:] if has_item and item is None and content.endswith(".") else []
             if any(each.kind in ("act", "say") and not PATTERNS["announces"].search(each.text) for each in last):
-                del self.scopes[self.levels[-1][1] :]  # the list below a whole rule has rules of its own
+                del self.scopes[self.levels[-1][1] :]  # the list below a complete rule contains separate rules
 
     def content(self, text: str) -> str:
-        """Return the content of a line without markup, in usual words; define a name if the line defines one."""
+        """Return the content of a line without markup and in usual words; remember a name that the line defines."""
         text = PATTERNS["summary"].sub("", text.strip(" \t#"))
         if (defined := PATTERNS["defined"].fullmatch(text)) and is_state(defined[3]):
             text = f'"{defined[2]}": {defined[3]}'
@@ -100,7 +100,7 @@ class SentenceReading(Reading):
         return PATTERNS["named"].sub(self.define, text).strip("\"'")
 
     def define(self, named: re.Match[str]) -> str:
-        """Remember the name of a condition, and return ""; return the text unless it defines a name."""
+        """Remember the name of a condition, and return ""; if the text defines no condition, return the text."""
         name, meaning = named[1] or named[2], named[3]
         if (
             not RELATION.search(meaning)
@@ -127,7 +127,7 @@ def _arrow_rule(line: str) -> str:
 
 
 def usual_words(text: str) -> str:
-    """Rewrite phrases that the grammar of clauses does not know."""
+    """Rewrite phrases that the parser of clauses does not know."""
     for pattern, plain in _REWRITINGS:
         text = pattern.sub(plain, text)
     return text
@@ -151,7 +151,7 @@ def _unwrapped(lines: list[str]) -> list[str]:
 
 
 def _indent(line: str) -> int:
-    """Return the depth of a line: headings, then sentences, then items, each by the blanks before it."""
+    """Return the depth of a line: up to 7 for a heading, otherwise at least 10, growing with indentation and items."""
     blanks, content = len(line) - len(line.lstrip()), line.lstrip()
     if (
         PATTERNS["heading"].fullmatch(line)

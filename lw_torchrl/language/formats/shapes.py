@@ -1,7 +1,7 @@
 """Convert values of JSON, YAML and XML to the few shapes that :mod:`.trees` can read.
 
 Tables with a header, flowcharts, rows with priorities, rules in strings and JSON in strings become lists and objects.
-The fields of an object are tests, goals, facts, programs, definitions or answers.
+The fields of an object are classified as tests, goals, facts, programs, definitions or answers.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from lw_torchrl.language.formats.values import parse_value
 from lw_torchrl.language.relations import PREDICATES
 
 MOST_VALUES, MOST_DEPTH = 20_000, 200  # YAML's references can repeat a value
-_MOST_FIELDS = 30  # of an object with a table and its header
+_MOST_FIELDS = 30  # maximum number of fields of an object with a table and its header
 RULE = re.compile(
     r"if (.+?),? then (.+?)(?:[,;]? (?:else|otherwise),? (.+))?|(.+?)\s*(?:->|=>|→)\s*(.+)", re.IGNORECASE
 )
@@ -44,10 +44,10 @@ _WORDS = {name: frozenset(words) for name, words in PROGRAM_WORDS["shapes"].item
 
 
 def usual_shape(value: Any) -> Any:
-    """Return a value in a usual shape.
+    """Convert a value to a shape that :mod:`.trees` can read.
 
     Raises:
-        ValueError: the value contains more than 20,000 others, or nests more than 200.
+        ValueError: the value contains more than 20,000 values, or is nested more than 200 levels deep.
 
     Example:
         >>> usual_shape({"inputs": ["gripper open"], "table": [["F", "open the gripper"], ["T", "move to the mug"]]})
@@ -98,7 +98,7 @@ def texts_in(value: Any) -> Iterator[tuple[str, str]]:
 def values_in(value: Any) -> Iterator[tuple[str, Any]]:
     """Yield a value and all values in it, each with its key."""
     stack = [("", value)]
-    for key, each in stack:  # grows
+    for key, each in stack:  # the stack grows during the loop
         yield key, each
         if isinstance(each, dict | list) and len(stack) < MOST_VALUES:
             pairs = each.items() if isinstance(each, dict) else ((key, part) for part in each)
@@ -226,7 +226,7 @@ def _from_text(text: str, usual: Any, depth: int) -> Any:
 
 
 def _listed(rows: list[Any]) -> Any:
-    """Return a list without arrows, and with its most urgent rows first."""
+    """Convert a list with arrows, pairs or a header to objects with rules, and put the most urgent rules first."""
     arrow = next((number for number, each in enumerate(rows) if isinstance(each, str) and each in _WORDS["arrows"]), 0)
     if arrow and arrow + 1 < len(rows):
         return {"if": rows[:arrow], "then": rows[arrow + 1 :]}
@@ -254,7 +254,7 @@ def _from_rules(row: dict[Any, Any]) -> list[dict[Any, Any]]:
 
 
 def _with_action(row: dict[Any, Any]) -> dict[Any, Any]:
-    """Rename the name of an object with conditions to "action", if it is one: {"name": "push the door", "pre": ...}."""
+    """Rename "name" to "action" if it holds an action, beside conditions: {"name": "push the door", "pre": ...}."""
     texts = [str(each) for key, each in row.items() if role_of(str(key)) == "name"]
     names = [text for text in texts if is_command(text) and is_told(text)]
     others = {key: each for key, each in row.items() if role_of(str(key)) != "name" or str(each) not in names}
@@ -264,7 +264,7 @@ def _with_action(row: dict[Any, Any]) -> dict[Any, Any]:
 
 
 def _by_urgency(rows: list[dict[Any, Any]]) -> list[dict[Any, Any]]:
-    """Sort rows by their priorities. A row without a condition excludes the later rows, so it has the last priority."""
+    """Sort rows by their priorities. A row without a condition hides the rows after it, so it must come last."""
     for key in rows[0]:
         cells = [str(row.get(key)) for row in rows]
         if len({*cells}) < len(rows) or not all(re.fullmatch(r"-?\d+(\.\d+)?", cell) for cell in cells):
@@ -320,7 +320,7 @@ def _chained(row: dict[Any, Any]) -> dict[Any, Any]:
 
 
 def _from_flowchart(row: dict[Any, Any]) -> dict[Any, Any]:
-    """Convert a flowchart, whose edges are a list with the answers "yes" and "no", to objects that name each other."""
+    """Convert a flowchart, with a list of edges and their answers "yes" and "no", to objects that name each other."""
     for name, nodes in row.items():
         pairs = nodes.items() if isinstance(nodes, dict) else enumerate(nodes if isinstance(nodes, list) else ())
         table = {

@@ -1,4 +1,4 @@
-"""State machines in JSON and YAML."""
+"""Convert state machines in JSON and YAML to selectors."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def source(value: Any) -> str:
 
 
 def machine(tree: Tree, row: dict[Any, Any]) -> Node | None:
-    """Convert a state machine to a selector: a later state is active once a condition that leads to it is true, and
-    while no condition that leads back is. A plan has no memory, so the state that was active before is unknown.
+    """Convert a state machine to a selector. A later state is active if a condition that leads to it is true and no
+    condition that leads back is true. A plan has no memory, so the state that was active before is unknown.
     """
     tables = {str(key): value for key, value in row.items() if isinstance(value, dict | list)}
     outside = [*transitions_of(tables).values()]
@@ -69,7 +69,7 @@ def machine(tree: Tree, row: dict[Any, Any]) -> Node | None:
         exits[name] = [pair for each in leading for pair in _exits(tree, each, states, done)]
     start = next((str(value) for key, value in row.items() if role_of(str(key)) == "start"), "")
     order = [start if start in states else next(iter(states))]
-    for name in order:  # grows
+    for name in order:  # the list grows during the loop
         order += dict.fromkeys(target for _, target in exits[name] if target not in order)
     order += [name for name in states if name not in order]
     parts = list[Node]()

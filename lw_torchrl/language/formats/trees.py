@@ -127,7 +127,7 @@ class TreeReading(Reading):
                 self.sections.append(Section("", start + 1, tree=node))
 
     def without_asides(self, value: Any, start: int, text: str) -> Any:
-        """Remove thoughts, examples and comments, unless no action remains, and note those that may be rules."""
+        """Remove thoughts, examples and comments, unless no action remains; note each that may be a rule."""
         removed = list[tuple[str, Any]]()
 
         def rest(value: Any) -> Any:
@@ -150,7 +150,7 @@ class TreeReading(Reading):
 
 
 class Tree:
-    """A converter of a JSON value to a program. A condition becomes a program that contains only checks."""
+    """A converter from a JSON value to a program. A condition becomes a program that contains only checks."""
 
     def __init__(self, reading: Reading, text: str, start: int, value: Any, unused: Collection[str] = ()) -> None:
         self.reading, self.text, self.start, self.at, self.count = reading, text, start, 0, 0
@@ -161,7 +161,7 @@ class Tree:
         self.define(value, unused)
 
     def define(self, value: Any, unused: Collection[str]) -> None:
-        """Find the programs and conditions that a text defines by name, which are read where they are named."""
+        """Find the programs and conditions that a text defines by name; they are parsed where their names are used."""
         tables = [each for _, each in values_in(value) if isinstance(each, dict | list)]
         self.has_edges = any(map(transitions_of, tables))
         counts, fields = _counts(value), Counter(texts_in(value))
@@ -180,7 +180,7 @@ class Tree:
                 if counts[name] > _counts([table[key]])[name]
             }
             inside = _counts(table) if len(found) > 1 else counts
-            is_table = any(counts[name] > inside[name] for name in found)  # named from outside
+            is_table = any(counts[name] > inside[name] for name in found)  # named outside the table
             self.hidden |= {(id(table), key) for key in (keys if is_table else found.values())}
             self.definitions |= {name: table[key] for name, key in found.items()}
             self.tables += [{*found}] if found and has_action([table[key] for key in found.values()]) else []
@@ -211,7 +211,7 @@ class Tree:
     def node(self, value: Any, hint: str = "") -> Node | None:
         """Convert a value to a program; None if it has neither actions nor conditions.
 
-        ``hint`` says what its texts are: "test" for conditions, "act" for actions, "" if only their content tells.
+        ``hint`` is the kind of its texts: "test" for conditions, "act" for actions, "" to infer it from the content.
         """
         self.count += 1
         if self.count > MOST_VALUES:
@@ -260,7 +260,7 @@ class Tree:
         return in_turn(words, self.line(text)) if words and (hint == "act" or is_told(text)) else None
 
     def said(self, text: str) -> Expression:
-        """Convert a condition to an expression, and replace each defined name by its definition."""
+        """Convert a condition to an expression, and replace each defined name with its definition."""
         text = _LEAD.sub("", text)
         self.conditions.add(text)
         if self.is_defined(text):
@@ -279,7 +279,7 @@ class Tree:
         return parse_words(words, operand, lambda number, expected: ValueError(expected)) or TRUE
 
     def phrase(self, value: Any, hint: str) -> Node | None:
-        """Join a value whose texts are names of objects, relations and verbs, such as {"near": ["gripper", "mug"]}."""
+        """Convert a value with names of objects, relations and verbs, such as {"near": ["gripper", "mug"]}."""
         parts = list[dict[Any, Any]]()
         if isinstance(value, dict) and hint != "act":
             for key, inner in value.items():  # {"gripper": {"near": "mug", "is": "open"}, "above": ["mug", "table"]}
@@ -319,7 +319,7 @@ class Tree:
         return _joined(nodes, kind)
 
     def object(self, row: dict[Any, Any], hint: str) -> Node | None:
-        """Convert an object: its type and flags are read here, its other fields by :meth:`branch`."""
+        """Convert an object. This method parses its type and flags, and :meth:`branch` parses its other fields."""
         flags = {plain(str(key)): truth_of(value) for key, value in row.items()}
         is_off = any(flag and (key in ("disabled", "skip") or is_aside(key)) for key, flag in flags.items())
         if is_off or flags.get("enabled") is False:
@@ -475,7 +475,7 @@ class Tree:
         if role in ("", "test", "loop") and is_statement(key):
             if (truth := truth_of(value)) is not None:
                 return Check(self.said(key) if truth else negate(self.said(key)))
-            if str(value).lower() in ("*", "-", "any", ""):  # of a decision table
+            if str(value).lower() in ("*", "-", "any", ""):  # any value, in a decision table
                 return None
             return self.object({"if": key, **(value if isinstance(value, dict) else {"then": value})}, "")
         is_deed = role == "" and is_command(key) and (value is None or isinstance(value, dict | list))
@@ -508,7 +508,7 @@ def _is_act(text: str) -> bool:
 
 
 def _sections(text: str) -> list[tuple[int, str | list[str]]]:
-    """Return the (line, text) pairs of a text's values; values that refer to names of another one are a single list."""
+    """Return a (line, text) pair per value in a text, or one pair with all texts if a value names parts of another."""
     blocks = [*code_blocks(text)]
     found = list[Any]()
     with suppress(ImportError, ValueError, RecursionError):

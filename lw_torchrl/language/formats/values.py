@@ -1,4 +1,4 @@
-"""Parse JSON, YAML and XML from language models: with comments, trailing commas, missing brackets or extra text."""
+"""Parse JSON, YAML and XML from language models, despite comments, trailing commas, missing brackets or extra text."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _DOCUMENT = re.compile(r"^(?:---|\.\.\.)[ \t]*$", re.MULTILINE)
 
 
 def parse_value(text: str) -> Any:
-    """Parse the JSON, YAML or XML in a text; None if there is none. Several values are a list.
+    """Parse the JSON, YAML or XML in a text. Return a list if there are several values, and None if there is none.
 
-    An element of XML becomes an object with its tag as "type".
+    An XML element becomes an object with its tag as "type".
 
     Raises:
         ImportError: the text may be YAML, and PyYAML is not installed.
-        ValueError: the JSON or XML nests more than 1,000 values and cannot be read.
+        ValueError: the XML nests more than 500 levels deep, or the JSON more than 1,000 and is invalid.
 
     Example:
         >>> parse_value('Here: {"if": "gripper open", /* wide */ "do": ["close", "lift",')
@@ -90,7 +90,7 @@ def _repaired(text: str) -> str:
         if not closers:
             break
     while closers and parts and not (parts[-1] in "]}[{" or (parts[-1][-1] == '"' and len(parts[-1]) > 1)):
-        parts.pop()  # of a value that is cut off
+        parts.pop()  # part of a value that is cut off
     if len(parts) > 1 and closers and closers[-1] == "}" and parts[-1][-1] == '"' and parts[-2].strip() != ":":
         parts.pop()  # a key without a value
     while parts and parts[-1] == ",":
@@ -100,7 +100,7 @@ def _repaired(text: str) -> str:
 
 def _xml(text: str) -> Any:
     """Parse XML, which may be cut off; None if the text has no elements."""
-    is_closed = re.search(r"</[A-Za-z]|/>", text)  # unlike the images of HTML
+    is_closed = re.search(r"</[A-Za-z]|/>", text)  # unlike <img> in HTML
     if not is_closed or "<!DOCTYPE" in text or "<!ENTITY" in text:
         return None
     parser: Any = ElementTree.XMLPullParser(["start"])

@@ -32,7 +32,7 @@ OPEN = 0.1
 
 
 def our_positions(positions: Array, origin: Array) -> Array:
-    """Convert positions (..., 3) from Fetch's to Meta-World's axes, whose ``origin`` (..., 3) is in Fetch's axes."""
+    """Convert positions (..., 3) from Fetch's to Meta-World's axes; ``origin`` (..., 3) is given in Fetch's axes."""
     offset = positions - origin
     return np.stack((-offset[..., 1], offset[..., 0], offset[..., 2]), -1)
 
@@ -111,7 +111,7 @@ class _Row:
         # The joints that actuators drive; controls are relative to the joint positions. Two tasks have no actuators.
         driven = [data.qpos[joint : joint + 1] for joint in self._model.jnt_qposadr[self._model.actuator_trnid[:, 0]]]
         self._target = self._model.site("target0").id
-        none = np.zeros(_DRIVEN.stop)  # values that the task does not have
+        none = np.zeros(_DRIVEN.stop)  # zeros for values that the task lacks
         grip = data.site_xpos[self._model.site("robot0:grip").id]
         objects = [none[_OBJECT], none[_QUATERNION]]
         driven = driven or [none[_DRIVEN]]

@@ -53,7 +53,7 @@ def find_row_kernel() -> ModuleType | None:
         if os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
             raise ImportError("NUMBA_DISABLE_JIT is set")
         from lw_torchrl.suites.metaworld import row_kernel
-    except Exception as error:  # a Numba that is too new can fail in any way; the results are the same without it
+    except Exception as error:  # too new a Numba can raise any error; the results are the same without Numba
         warnings.warn(
             f"engine: the simulation runs in Python threads, which are slower than compiled code, because Numba cannot "
             f"be used ({type(error).__name__}: {error}); pip install 'lw_torchrl[fast]', and set NUMBA_CACHE_DIR to a "

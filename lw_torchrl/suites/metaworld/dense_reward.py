@@ -285,7 +285,7 @@ FULL_REWARD = 10.0
 
 
 class EpisodeStarts:
-    """Values of the first state of each row's episode, as far as the reward of the row depends on them."""
+    """The values from the first state of each row's episode that the rewards depend on."""
 
     def __init__(self, rewards: Sequence[TaskReward]) -> None:
         self.rewards = tuple(rewards)

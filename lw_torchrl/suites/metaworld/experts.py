@@ -17,7 +17,7 @@ from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 from lw_torchrl.suites.metaworld.environments import import_metaworld
 
-_quiet = Lock()  # warning filters are global: two threads at the same time would not restore them correctly
+_quiet = Lock()  # warning filters are global: two threads that change them at once would not restore them
 
 
 class ExpertActor(TensorDictModuleBase):

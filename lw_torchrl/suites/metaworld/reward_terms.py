@@ -165,7 +165,7 @@ class Proximity(NamedTuple):
     """A measure of how close two points are, for each row and term; all arrays are (rows, 4)."""
 
     distance: Array
-    margin: Array  # the additional distance at which the value is 0.1
+    margin: Array  # distance beyond the limit at which the value falls to 0.1
     value: Array  # 1 if the points are close, otherwise less than 1
 
 

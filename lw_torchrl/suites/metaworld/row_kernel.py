@@ -26,7 +26,7 @@ from lw_torchrl.suites.metaworld.environments import WARNED_ALREADY, Places
 if sys.platform != "linux":
     raise ImportError("the compiled simulation is supported only on Linux")
 
-# The bindings' library depends on MuJoCo's, so a look-up in it finds the copy of MuJoCo that the bindings use.
+# The bindings' library depends on MuJoCo's, so its symbols include the copy of MuJoCo that the bindings use.
 _mujoco = ctypes.CDLL(mujoco._functions.__file__)
 _system = ctypes.CDLL(None)
 _pointer = types.voidptr
@@ -60,7 +60,7 @@ _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 _MATRIX, _QUATERNION = observation.MATRIX.start, observation.QUATERNION.start
 _CLOCK = int(time.CLOCK_MONOTONIC)
 
-# The key of a thread's jump buffer. Compiled code finds it by name, because cached code runs in several processes.
+# The key of a thread's jump buffer. Compiled code finds the key by name, because cached code runs in several processes.
 _key = ctypes.c_uint32()
 if _system.pthread_key_create(ctypes.byref(_key), None):
     raise ImportError("the process has no free key for data of its threads (pthread_key_create)")

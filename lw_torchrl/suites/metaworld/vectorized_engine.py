@@ -60,7 +60,7 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         rewards = [reward_table()[task] if dense else None for task in tasks]
         rows: dict[int, simulated_rows.SimulatedRow] = {}
         models: list[environments.SharedModel] = []
-        # The models are given back even if the engine is never closed.
+        # The models return to the pool even if the engine is never closed.
         self._return_models = weakref.finalize(self, environments.return_models, models)
         for group in self._groups:
             models.append(shared := environments.borrow_model(environments.model_path(tasks[group.rows[0]])))
