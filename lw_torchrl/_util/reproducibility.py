@@ -40,7 +40,7 @@ def _installed(name: str) -> str:
 
 
 def differences(was: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """Return the keys whose values differ in two nested mappings, with short values, such as "steps (40, now 30)"."""
+    """Return the keys that differ in two nested mappings, with their values if short, as in "steps (40, now 30)"."""
     names = []
     for key in sorted({**was, **now}):
         before, after = was.get(key), now.get(key)

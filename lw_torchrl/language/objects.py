@@ -28,7 +28,7 @@ _INDEX = re.compile(r"obs\[([0-9]{1,4})\]")
 
 
 def typed_position(position: Sequence[Coordinate]) -> TypedPosition:
-    """Tag each coordinate with its kind (index or metres), because 1 == 1.0 in Python."""
+    """Tag each coordinate with its kind, so that index 1 and 1.0 m differ (1 == 1.0 in Python)."""
     return tuple((isinstance(coordinate, int), coordinate) for coordinate in position)
 
 

@@ -190,7 +190,7 @@ def _plain(text: str) -> list[str]:
 
 
 def _is_fist(text: str, facts: _Facts, is_first: bool) -> bool:
-    """Return whether "close the gripper" makes a fist for pushing, that is, before the hand is at an object."""
+    """Return whether "close the gripper" makes a fist for pushing: the hand is not yet at an object."""
     is_bare = text.startswith("close ") and "<" not in text.replace(f"<{GRIPPER}>", "")
     return is_bare and (bool(facts.near) or is_first) and not facts.at
 

@@ -73,7 +73,7 @@ class ConditionedActor(NamedParts):
             features (B, F).
         decoder: a module that maps latent and features (B, D + F) float32 to the action (B, A), or a TensorDict module;
             None for :class:`MLPDecoder`.
-        in_keys: replacements for the keys that the policy reads, in the order of ``in_keys``; nested keys are allowed.
+        in_keys: replacements for the keys that the policy reads, in the same order; nested keys are allowed.
         out_keys: the keys for the outputs of a plain decoder; None for ``action``.
 
     Example:

@@ -326,7 +326,7 @@ def _moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
 
 
 def _ahead(plan: ConditionalPlan) -> list[list[Pair]]:
-    """Return, for each plan step, the pair (first object, target) if it moves toward the goal or an object, else []."""
+    """Return [(first object, target)] for each plan step that moves toward the goal or an object, else []."""
     task = plan.definition
     x, y, z = places(task.layout.positions[1])
     first = NamedObject("first object", (x, y, z))

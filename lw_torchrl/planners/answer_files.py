@@ -67,7 +67,7 @@ class Reply:
 
     @property
     def is_answer(self) -> bool:
-        """Whether the model answered or refused. Other replies, such as reasoning without an answer, are not cached."""
+        """True if the model answered or refused. Other replies, such as reasoning without an answer, are not cached."""
         return bool(re.search(r"\w", without_thoughts(self.text, [])) or self.refusal.strip())
 
 

@@ -251,7 +251,7 @@ def is_action(text: str) -> bool:
 
 
 def action(text: str, is_certain: bool = False) -> str:
-    """Return "push it" for "push it", "the robot should push it", "it pushes it" and "it is pushed"; "" if no action.
+    """Return "push it" for "push it", "the robot should push it", "it pushes it" and "it is pushed"; otherwise "".
 
     With ``is_certain``, "the gripper is closed" gives "close the gripper"; by default, this text is not an action.
     """

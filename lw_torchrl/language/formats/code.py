@@ -294,7 +294,7 @@ class _Scope(Expressions):
         return [] if text is None or isinstance(text, Name) else [action(text, node.lineno)]
 
     def first(self, values: Sequence[ast.expr]) -> Node:
-        """Return the first action of "grasp(...) or lift(...) or 'wait'", and skip any helper that returns None."""
+        """Convert "grasp(...) or lift(...) or 'wait'" to a program that runs the first truthy operand."""
         result: Node = Block()
         for each in reversed(values):
             text = self.value(each)

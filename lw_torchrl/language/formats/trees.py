@@ -319,7 +319,7 @@ class Tree:
         return _joined(nodes, kind)
 
     def object(self, row: dict[Any, Any], hint: str) -> Node | None:
-        """Convert an object. This method parses its type and flags, and :meth:`branch` parses its other fields."""
+        """Convert a mapping. This method parses its type and flags, and :meth:`branch` parses its other fields."""
         flags = {plain(str(key)): truth_of(value) for key, value in row.items()}
         is_off = any(flag and (key in ("disabled", "skip") or is_aside(key)) for key, flag in flags.items())
         if is_off or flags.get("enabled") is False:
@@ -508,7 +508,7 @@ def _is_act(text: str) -> bool:
 
 
 def _sections(text: str) -> list[tuple[int, str | list[str]]]:
-    """Return a (line, text) pair per value in a text, or one pair with all texts if a value names parts of another."""
+    """Return a (line, text) pair for each code block, or one pair with all blocks if a block names keys of another."""
     blocks = [*code_blocks(text)]
     found = list[Any]()
     with suppress(ImportError, ValueError, RecursionError):
@@ -522,7 +522,7 @@ def _sections(text: str) -> list[tuple[int, str | list[str]]]:
 
 
 def _counts(value: Any) -> Counter[str]:
-    """Count the texts of a value that may refer to a definition."""
+    """Count possible references to definitions in a value: each text, and its parts joined by "and" or "or"."""
     texts = [text for key, text in texts_in(value) if role_of(key) not in ("name", "comment")]
     return Counter(name for text in texts for name in {text, *_AND_OR.split(text)})
 

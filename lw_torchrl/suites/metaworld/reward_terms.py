@@ -120,7 +120,7 @@ def gather_features(task: Parameters, sensors: Array, current: Array, goal: Arra
 
 
 Numbers = NDArray[np.floating]
-"""Single or double precision: Meta-World uses the action's precision if a term depends on the gripper action."""
+"""A float32 or float64 array: Meta-World uses the action's precision if a term depends on the gripper action."""
 
 AT_MARGIN = 0.1  # the value of a term whose distance equals the margin
 LONG_TAIL = np.sqrt(1 / AT_MARGIN - 1)
