@@ -386,8 +386,8 @@ class CoLearningSampler(GroupSampler):
         # The float 1/3 is not exactly a third, so the shares are computed with the nearest simple fraction.
         self.target_fraction = Fraction(target_fraction).limit_denominator(10_000)
         if not 0 < target_fraction < 1 or not isclose(self.target_fraction, target_fraction, rel_tol=1e-9):
-            ratio = "must be between 0 and 1, and a ratio of integers up to 10000"
-            raise ValueError(f"target_fraction {ratio}, got {target_fraction}; the nearest is {self.target_fraction}")
+            ratio = "must be a ratio of integers up to 10000, above 0 and below 1"
+            raise ValueError(f"target_fraction {ratio}, got {target_fraction} (about {self.target_fraction})")
         self.target, self.task_key = target, task_key
         name = target.name if isinstance(target, Task) else target
         self._target_id = task_id(name) if isinstance(name, str) else name

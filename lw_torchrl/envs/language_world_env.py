@@ -275,7 +275,7 @@ class LanguageWorldEnv(EnvBase):
 
         Args:
             camera: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV".
-            height, width: size of a picture, in pixels.
+            height, width: image size in pixels.
             rows: indices of the rows to render; None for all rows.
 
         Raises:

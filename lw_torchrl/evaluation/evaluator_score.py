@@ -72,7 +72,7 @@ class EvaluatorScore:
     about: dict[str, Any]  # a JSON description of the data and the splits
 
     def table(self, most: int = 4) -> str:
-        """Return a text table of the accuracies, with the worst predicates (at most ``most``) of each held-out split."""
+        """Return a text table of the accuracies, with up to ``most`` of the worst predicates of each held-out split."""
         lines = [f"{'':36}{'answers':>10}{'accuracy':>10}{'balanced':>10}"]
         for part, score in self.parts.items():
             rows: list[tuple[str, int, str | None]] = [(PARTS[part], score.answers, None)]

@@ -57,7 +57,7 @@ class EvaluationResult:
 
     @cached_property
     def success_at_end(self) -> dict[str, float | None]:
-        """The fraction of each task's episodes that were successful at the last time step; None if stopped early."""
+        """The fraction of each task's episodes that succeed at the last time step; None if episodes stopped early."""
         return self._by_task(lambda episodes: _mean([e.success_at_end for e in episodes]))
 
     @cached_property

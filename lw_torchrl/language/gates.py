@@ -24,7 +24,7 @@ the minimum of the logits ("min-max") or the logit of the product of the probabi
 def inner_gates(expressions: Iterable[Expression]) -> dict[Expression, int]:
     """Return the conjunctions inside expressions, each with its level from 0, ordered by level.
 
-    A disjunction is included as the conjunction that it negates. A conjunction that is a whole expression is left out.
+    A disjunction "a or b" is returned as the conjunction "not a and not b". Top-level conjunctions are left out.
     """
     levels: dict[Expression, int] = {}
     for expression in expressions:

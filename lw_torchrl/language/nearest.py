@@ -190,7 +190,7 @@ def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
 
 
 def _stated(written: list[str]) -> set[str]:
-    """Return the predicates for which a text has a word: "it is 5 o'clock" has no word for "closed"."""
+    """Return the predicates that a text mentions, even misspelt; "o'clock" does not count as "closed"."""
     words = [word for word in dict.fromkeys(written[:_LONGEST]) if word not in _EMPTY]
 
     def is_stated(predicate: str) -> bool:
@@ -362,7 +362,7 @@ def _with_object(text: str, task: Task) -> str:
 
 
 def _with_relation(text: str, task: Task) -> str:
-    """Repeat the relation to two objects: "near the mug and the goal" gives "near the mug and near the goal"."""
+    """Repeat a relation for its second object: "near the mug and the goal" gives "near the mug and near the goal"."""
     names = "|".join(map(re.escape, sorted(task.object_names, key=len, reverse=True)))
     relations = "|".join(map(re.escape, sorted(RELATIONS, key=len, reverse=True)))
     return re.sub(

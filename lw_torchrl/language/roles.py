@@ -163,7 +163,7 @@ def _tokens(marked: str) -> list[str]:
 
 
 def _is_used(word: str, task: Task) -> bool:
-    """Return whether the parser of steps uses a word."""
+    """Return whether the step parser uses a word."""
     form = re.sub(r"(?:ed|es|s)$", "ing", word)  # "aligned", "touches"
     return _used_words(task).issuperset(re.findall(r"\w+", word)) or command_form(form) is not None
 

@@ -323,7 +323,7 @@ class LineParser:
         return row
 
     def ask(self, clause: Clause) -> None:
-        """Add a question."""
+        """Begin a choice whose condition is a question; later clauses give its cases: "Is it open? If yes, ..."."""
         is_known = RELATION.search(clause.text) or self.refers.is_named(clause.text)
         if not is_known and self.next.kind not in ("yes", "no", "not", "same", "different"):
             return
@@ -436,7 +436,7 @@ class LineParser:
         self.place(clause, re.sub(r"(?:,? (?:instead|first|again|then))+$", "", text), self.scopes[-1])
 
     def replace_last(self) -> None:
-        """Make the last action the other case of the choice that just began: "if it is open, close it instead"."""
+        """Move the last action to the else branch of the new choice: "if it is open, close it instead"."""
         opened = self.opens[-1]
         before = [part for part in opened.scopes[-1] if part is not opened.choice]
         if opened.choice.branches[-1][1] is not self.scopes[-1] or len(before) == len(opened.scopes[-1]):

@@ -264,7 +264,7 @@ def _with_action(row: dict[Any, Any]) -> dict[Any, Any]:
 
 
 def _by_urgency(rows: list[dict[Any, Any]]) -> list[dict[Any, Any]]:
-    """Sort rows by their priorities. A row without a condition hides the rows after it, so it must come last."""
+    """Sort rows by priority; reverse them if a row without a condition would come first and hide the others."""
     for key in rows[0]:
         cells = [str(row.get(key)) for row in rows]
         if len({*cells}) < len(rows) or not all(re.fullmatch(r"-?\d+(\.\d+)?", cell) for cell in cells):
