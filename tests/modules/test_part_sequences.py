@@ -182,3 +182,11 @@ def test_compiled_actor_refuses_at_run_time():
     wrong["observation"][1, 2] = torch.nan
     with pytest.raises(RuntimeError, match="finite numbers"):
         act(wrong)
+
+
+def test_a_part_must_write_what_the_next_ones_read():
+    actor = lw.PlanConditionedActor(PLANS)
+    with pytest.raises(ValueError, match=r"features must write .*, which later parts read"):
+        actor.features = TensorDictModule(nn.Linear(39, 56), ["observation"], ["seen"])
+    with pytest.raises(ValueError, match="trunk must have at least two named parts"):
+        Value(TensorDictSequential(PlanAttention(PLANS), SkillMixer(PLANS)))
