@@ -40,6 +40,29 @@ class Engine(Protocol):
         """Free the simulators."""
 
 
+def seeds_of_rows(rows: Sequence[int], seeds: Sequence[int]) -> tuple[NDArray[np.intp], dict[int, int]]:
+    """Return the rows to reset as an array, and a dict from row to seed; raise a :class:`ValueError` if there are not
+    as many seeds as rows."""
+    index = np.asarray(rows, dtype=np.intp).reshape(-1)
+    if len(index) != len(seeds):
+        raise ValueError(f"seeds must hold one seed per row ({len(index)} rows), got {len(seeds)} seeds")
+    return index, dict(zip(index.tolist(), map(int, seeds), strict=True))
+
+
+def checked_step(
+    action: Any, active: Any, started: NDArray[np.bool_], size: int
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Convert the actions (N, size) and the mask (N,) bool of a step to arrays. Raise a ValueError for wrong shapes,
+    and a RuntimeError if an active row has not ``started``."""
+    action, active, n = np.asarray(action), np.asarray(active, dtype=bool), len(started)
+    if action.shape != (n, size) or active.shape != (n,):
+        raise ValueError(f"action must have shape {(n, size)} and active {(n,)}, got {action.shape}, {active.shape}")
+    if not started[active].all():
+        row = int(np.flatnonzero(active & ~started)[0])
+        raise RuntimeError(f"row {row} must be reset before the first step, and after a step that was interrupted")
+    return action, active
+
+
 class RowModel(NamedTuple):
     """A row's compiled MuJoCo model (read-only) and the ``path`` of the XML file. Models of the same file have the same
     meshes. Rows may share a model, so ``body_pos`` and ``site_pos`` may be those of another row."""

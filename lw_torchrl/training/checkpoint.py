@@ -192,6 +192,11 @@ def _copy_tensors(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> N
         tensor.copy_(stored[name])
 
 
+def not_finite(weights: Mapping[str, Tensor]) -> list[str]:
+    """Return the names of the weights that hold NaN or infinity."""
+    return [name for name, tensor in weights.items() if not tensor.isfinite().all()]
+
+
 def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
     """Raise an error unless a module can be saved and loaded. Trainers call this before training."""
     widths = [vectors.shape[-1] for vectors in text_vectors(module).values()] or [TEXT_DIMENSION]

@@ -21,7 +21,7 @@ from lw_torchrl._util.devices import CPU
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.training.captured import CapturedFunction, captures, foreign_code
-from lw_torchrl.training.checkpoint import CheckpointFiles, contents_of
+from lw_torchrl.training.checkpoint import CheckpointFiles, contents_of, not_finite
 from lw_torchrl.training.minibatches import Minibatches
 from lw_torchrl.training.normalization import share_contacts
 
@@ -333,7 +333,7 @@ class Training:
 
     def save(self) -> None:
         """Check that all weights are finite, then write the checkpoint files atomically if ``checkpoint`` is set."""
-        if bad := [name for name, tensor in self.parameters().items() if not tensor.isfinite().all()]:
+        if bad := not_finite(self.parameters()):
             raise ValueError(f"weights: {bad[0]} is NaN or infinite after step {self.steps}; try a lower learning rate")
         if self._files is not None:
             part = self.saved if self.part else None

@@ -132,7 +132,7 @@ def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, s
     if isinstance(replay.sampler, PrioritizedSampler):
         raise ValueError("replay must not use a PrioritizedSampler, because the trainers do not update priorities")
     if not _draws_on_cpu(replay) and device_of_rows(replay.storage) != CPU:
-        raise ValueError("replay: draws on the GPU cannot be resumed; use a TaskBalancedSampler, or rows on the CPU")
+        raise ValueError(f"replay: {type(replay.sampler).__name__} cannot resume on a GPU; use a TaskBalancedSampler")
 
 
 def check_augmentations(loss: LossModule, networks: Iterable[nn.Module], replay: TensorDictReplayBuffer) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lw_torchrl._util.workers import available_cores
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
-from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel
+from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
 from lw_torchrl.suites.metaworld import observation as at
 from lw_torchrl.suites.metaworld.compiled_rows import CompiledRows, addresses_of, find_row_kernel
 from lw_torchrl.suites.metaworld.environments import UNSTABLE, WARNED_ALREADY, SharedModel
@@ -288,7 +288,7 @@ class ThreadedEngine(SeenRows):
         """Step ``rows``, given the actions of all rows; write their observations, rewards, success flags and faults."""
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
-        index, seed_of = np.array(rows, dtype=np.intp), dict(zip(rows, seeds, strict=True))
+        index, seed_of = seeds_of_rows(rows, seeds)
         # If the reset fails half-way, the rows stay marked as not started, so they cannot be stepped.
         self._started[index] = False
         self._pool.work(self._by_group(index), lambda row: self._reset_row(row, seed_of[row]))
@@ -300,14 +300,10 @@ class ThreadedEngine(SeenRows):
         return self._observation[index]
 
     def step(self, action: NDArray[Any], active: Mask) -> EngineStep:
-        n, size = len(self._started), self._layout.action_size
-        if action.shape != (n, size) or active.shape != (n,):
-            raise ValueError(f"action must be {(n, size)} and active {(n,)}, got {action.shape} and {active.shape}")
-        if (waiting := np.flatnonzero(active & ~self._started)).size:
-            raise RuntimeError(f"row {waiting[0]} must be reset before the first step, and after an interrupted step")
+        action, active = checked_step(action, active, self._started, self._layout.action_size)
         # NaN must not reach the physics: MuJoCo would silently restart the row.
         self._faulted |= active & ~np.isfinite(action).all(axis=1)
-        reward, success = np.zeros(n), np.zeros(n, dtype=bool)
+        reward, success = np.zeros(len(active)), np.zeros(len(active), dtype=bool)
         if (rows := np.flatnonzero(active & ~self._faulted)).size:
             # If the step is interrupted, the rows stay marked as not started, so they must be reset.
             self._started[rows] = False
