@@ -40,8 +40,8 @@ class FinishedEpisode(NamedTuple):
 
 
 def num_rows(episodes: Mapping[str, Sequence[int]], most: int, num_envs: int | None = None) -> int:
-    """Return the number of environments to step together: ``num_envs``, or if that is None, about ``most``, divided
-    equally among the tasks. The number never exceeds the number of episodes that can run at once."""
+    """Return the number of environments to step together: ``num_envs``, or by default about ``most``, divided equally
+    among the tasks. It is at most the number of tasks times the most episodes of a task."""
     tasks, longest = len(episodes), max(map(len, episodes.values()))
     return min(tasks * longest, tasks * max(1, most // tasks) if num_envs is None else num_envs)
 

@@ -8,11 +8,16 @@ from rows import ENGINES, ROWS, STATE, STEPS, actions_of, advance, others, row_a
 import lw_torchrl as lw
 
 
+def begun_again(env, seed):
+    """Return the trajectories of the seed's episodes, and the first state of the same episodes begun again."""
+    env.set_seed(seed)
+    reference = trajectories(env, STEPS)
+    env.set_seed(seed)
+    return reference, env.reset()
+
+
 def test_partial_resets_change_only_their_rows(any_env):
-    any_env.set_seed(4)
-    reference = trajectories(any_env, STEPS)
-    any_env.set_seed(4)
-    state = any_env.reset()
+    reference, state = begun_again(any_env, seed=4)
     for step in range(5):
         state = advance(any_env, state, row_actions(state, step))
     before = state.select(*STATE).clone()
@@ -31,10 +36,7 @@ def test_partial_resets_change_only_their_rows(any_env):
 @pytest.mark.parametrize("shape", [(ROWS,), (ROWS, 1)], ids=str)
 def test_rows_outside_a_step_mask_do_not_move(any_env, shape):
     """Rows that pause, even with NaN actions, run as rows that do not."""
-    any_env.set_seed(6)
-    reference = trajectories(any_env, STEPS)
-    any_env.set_seed(6)
-    state = any_env.reset()
+    reference, state = begun_again(any_env, seed=6)
     keys = list(zip(state["task_id"].tolist(), state["episode"].tolist(), strict=True))
     clock = np.zeros(ROWS, dtype=int)
     rng = np.random.default_rng(1)
@@ -198,10 +200,7 @@ def test_a_wrong_action_is_an_error_and_moves_nothing(any_env, action):
 
 
 def test_a_row_with_a_nan_action_is_truncated_and_others_continue(any_env):
-    any_env.set_seed(2)
-    reference = trajectories(any_env, STEPS)
-    any_env.set_seed(2)
-    state = any_env.reset()
+    reference, state = begun_again(any_env, seed=2)
     for step in range(3):
         state = advance(any_env, state, row_actions(state, step))
     before = state
