@@ -74,7 +74,7 @@ def test_lerobot_datasets_are_imported(tmp_path, version):
 
 def test_tasks_are_mapped_and_episodes_counted(tmp_path):
     source = lerobot(tmp_path / "theirs", tasks=("shove", "reach", "shove"))
-    with pytest.raises(ValueError, match=r"task .* 'shove'.*; or map it"):
+    with pytest.raises(ValueError, match=r"task .* 'shove'.*to map it"):
         lw.import_dataset(source, tmp_path / "out")
     mapping = {"shove": "push"}
     with pytest.raises(ValueError, match=r"episodes_per_task .* 2 of push, 1 of reach"):
