@@ -93,10 +93,10 @@ def try_plan(
         ((), 1.0, 1.0)
     """
     task = get_task(task, tasks)
-    return _check_decoded(decode_plan(text, task, format, skills=skills, tasks=tasks), task, episodes, seed, skills)
+    return _try_decoded(decode_plan(text, task, format, skills=skills, tasks=tasks), task, episodes, seed, skills)
 
 
-def _check_decoded(decoded: DecodedPlan, task: Task, episodes: int, seed: int, skills: Skills | None) -> PlanCheck:
+def _try_decoded(decoded: DecodedPlan, task: Task, episodes: int, seed: int, skills: Skills | None) -> PlanCheck:
     if decoded.plan is None:
         return PlanCheck(task.name, decoded)
     expert = expert_use({task.name: decoded.plan}, task.name, episodes_per_task=episodes, seed=seed)[task.name]
@@ -211,7 +211,7 @@ def repair_plans(
         with Progress("carrying out", len(answers), "plan", show=progress) as bar:
             for answer in answers:
                 task = get_task(answer.task, tasks)
-                checks.append(_check_decoded(answer.decoded, task, episodes, seed, planner.skills))
+                checks.append(_try_decoded(answer.decoded, task, episodes, seed, planner.skills))
                 bar.update()
         return checks
 

@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from lw_torchrl._util.checks import shown, typed
+from lw_torchrl._util.devices import finite
 from lw_torchrl._util.files import AnyPath, absent_policy, expanded, locked, shipped_policy
 from lw_torchrl._util.reproducibility import LIBRARIES, differences, warn_of_other_versions
 from lw_torchrl._util.tensor_files import AllocationLimit, pop_state, read_tensors, write_tensors
@@ -186,7 +187,7 @@ def _copy_tensors(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> N
         if (stored[name].dtype, stored[name].shape) != (tensor.dtype, tensor.shape):
             got = f"{stored[name].dtype} of shape {tuple(stored[name].shape)}"
             raise ValueError(f"{name} must be {tensor.dtype} of shape {tuple(tensor.shape)}, got {got}")
-        if isinstance(tensor, nn.Parameter) and not stored[name].isfinite().all():
+        if isinstance(tensor, nn.Parameter) and not finite(stored[name]):
             raise ValueError(f"weights: {name} must be finite, but holds NaN or infinity")
     for name, tensor in weights.items():
         tensor.copy_(stored[name])
@@ -194,7 +195,7 @@ def _copy_tensors(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> N
 
 def not_finite(weights: Mapping[str, Tensor]) -> list[str]:
     """Return the names of the weights that hold NaN or infinity."""
-    return [name for name, tensor in weights.items() if not tensor.isfinite().all()]
+    return [name for name, tensor in weights.items() if not finite(tensor)]
 
 
 def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
