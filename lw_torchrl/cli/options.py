@@ -171,7 +171,7 @@ def is_object(policy: str) -> bool:
 
 
 def read_object(name: str) -> Any:
-    """Import the policy called "my_module:policy"."""
+    """Import a policy by a name such as "my_module:policy"."""
     policy = import_object("the policy", name)
     if not callable(policy) or isinstance(policy, type):
         raise ValueError(f"the policy {name} must map a TensorDict to a TensorDict, got {policy!r:.80}")

@@ -262,7 +262,7 @@ class Read:
         text = read_text(file, ValueError)
         decoded = decode_plan(text, self.task or options.task_of_answer(file, text, known), format, tasks=known)
         if self.scripted and decoded.plan is not None and decoded.scripted is None:
-            raise PlanError(f"{file}: --scripted: no step has a scripted skill that is near enough")
+            raise PlanError(f"{file}: --scripted: no scripted skill has a text similar enough to a step's skill")
         if decoded.plan is not None:
             return [((decoded.scripted if self.scripted else None) or decoded.plan, decoded)]
         if len(self.sources) == 1:

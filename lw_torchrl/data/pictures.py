@@ -124,7 +124,7 @@ def add_pictures(
 def _render(
     demonstrations: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], pictures: Pictures
 ) -> list[list[np.ndarray[Any, Any]]]:
-    """Re-run some episodes of one task in parallel, and return the pictures of each episode."""
+    """Re-run some episodes of one task in parallel, and return the camera images of each episode."""
     task, seed, steps = episodes[0].task, demonstrations.config.seed, demonstrations.config.max_steps
     base = LanguageWorldEnv(task, num_envs=len(episodes), seed=seed, max_steps=steps)
     camera = CameraTransform(pictures.cameras, height=pictures.height, width=pictures.width, every=pictures.every)

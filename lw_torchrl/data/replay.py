@@ -236,7 +236,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         if not finite(values):
             raise ValueError(f"values of {name!r} must be finite, got NaN or infinity")
         if of is not None and not torch.equal(*(each.storage[:].get("observation").cpu() for each in (self, of))):
-            raise ValueError("of must hold the rows of this buffer in the same order; use the same episodes and keep")
+            raise ValueError("of= must hold this buffer's rows in the same order: pass the same episodes= and keep=")
         own = values.detach().clone()
         self.storage.add_column(name, own.to(self.storage.device))
         self.columns = {**self.columns, name: sha256(own.cpu().contiguous().numpy().tobytes()).hexdigest()}

@@ -120,7 +120,7 @@ def _floats(numbers: Sequence[float]) -> _Floats:
 
 
 def _position(position: Sequence[Coordinate], state: _Floats) -> _Floats:
-    """Return the coordinates (3,) of a position in a state, in metres."""
+    """Return the coordinates (3,) of a named position in a state, in metres."""
     return _floats([state[at] if isinstance(at, int) else at for at in position])
 
 

@@ -141,7 +141,7 @@ def _replaces(line: _Line) -> bool:
 
 
 def _withdrawn(lines: list[_Line]) -> list[tuple[int, int]]:
-    """Return the span from the first rule to the last line that withdraws or replaces the text above it."""
+    """Return the span of withdrawn text: from the plan's first rule to the last line that withdraws or replaces it."""
     rules = [number for number, line in enumerate(lines) if _BEGINS.match(line.text)]
     first = next((number for number, line in enumerate(lines) if _BEGINS.match(line.text) or _ITEM.match(line.text)), 0)
     end = next((number for number in reversed(range(first, rules[-1] if rules else 0)) if _replaces(lines[number])), 0)

@@ -325,7 +325,7 @@ def _mapped_guard(
 
 
 def _why_none(reading: Reading, steps: list[DecodedStep], task: Task, text: str) -> str:
-    """Return the reason why a text has no plan."""
+    """Return the reason why no plan was found in a text."""
     if steps:
         return f"all steps for {task.name} were dropped ({len(steps)}), the first because {steps[0].dropped}"
     if reading.error:

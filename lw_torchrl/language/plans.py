@@ -306,7 +306,7 @@ class Plans(Mapping[str, ConditionalPlan]):
 
     @classmethod
     def from_json(cls, row: Any) -> Plans:
-        """Rebuild the plans from :meth:`to_json`; raise a PlanError if ``row`` is not such JSON."""
+        """Rebuild plans from the result of :meth:`to_json`; raise a PlanError if ``row`` has another form."""
         if not isinstance(row, dict):
             raise PlanError(f"plans must be an object that maps task names to plans, got {shown(row)}")
         return cls([ConditionalPlan.from_json(name, plan) for name, plan in row.items()])

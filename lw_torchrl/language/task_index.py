@@ -148,9 +148,9 @@ class PlanTables:
 def answers_of(qaf: Tensor, task_id: Tensor, number: Tensor | None, tables: PlanTables) -> tuple[Tensor, Tensor]:
     """Return ``qaf`` (..., S), and each task's row (...) int64 in ``tables`` of plans with S steps.
 
-    ``qaf`` may be longer than S if it was computed for a larger set of plans. In this case ``qaf`` is cut to S if
-    ``number`` (the ``qaf_plan``) shows that the tasks' plans are equal. A task without a plan or with another plan
-    raises a ValueError.
+    ``qaf`` may be longer than S if it was computed for a larger set of plans. It is cut to S if ``number`` (the
+    ``qaf_plan``) shows that each task has the same plan in both sets. Raise a ValueError if a task has no plan or a
+    different one.
     """
     rows = tables.rows(one_per_row(task_id, qaf))
     tables.refuse_others(number, rows)

@@ -83,7 +83,7 @@ class Task:
 
     @cached_property
     def openings(self) -> dict[str, int]:
-        """The observation index of each object's opening, keyed by object name; the gripper comes first."""
+        """The observation index of each object's degree of opening, keyed by object name; the gripper comes first."""
         openings = {named.name: named.opening for named in self.objects if named.opening is not None}
         return {GRIPPER: self.layout.opening, **openings}
 

@@ -78,7 +78,7 @@ class PlanAttention(Part):
         return self.in_keys[2] if self.has_fallback else None
 
     def with_plans(self, plans: AnyPlans) -> PlanAttention:
-        """Return a :class:`PlanAttention` for different plans."""
+        """Return a :class:`PlanAttention` for another set of plans."""
         other = PlanAttention(plans, out_keys=self.out_keys_source)
         # Only one of the modules may read a turn. The key of the turn comes last.
         other.in_keys = [*self.in_keys, *other.in_keys[len(self.in_keys) :]][: len(other.in_keys)]

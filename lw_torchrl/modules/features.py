@@ -123,7 +123,7 @@ class ObservationFeatures(Features):
         return {"kind": self.kind, "noise": self.noise, "layout": self.layout, **keys}
 
     def with_plans(self, plans: AnyPlans) -> ObservationFeatures:
-        """Return a module with the same statistics for different plans; raise a :class:`ValueError` if the features
+        """Return a module with the same statistics for another set of plans; raise :class:`ValueError` if the features
         have a different meaning in the layout of those plans."""
         layout = as_plans(plans).layout
         if layout == self.layout:
@@ -206,7 +206,7 @@ class Concat(TensorDictModuleBase):
         return {"*parts": list(self.parts), "out_keys": self.out_keys_source}
 
     def with_plans(self, plans: AnyPlans) -> Concat:
-        """Return the same features for different plans."""
+        """Return the same features for another set of plans."""
         parts = [follow(part, plans) for part in self.parts]
         return in_mode_of(self, Concat(*parts, out_keys=self.out_keys_source))
 

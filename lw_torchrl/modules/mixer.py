@@ -107,7 +107,7 @@ class SkillMixer(Part):
         return None if self.plans.has_roles else self.vectors
 
     def with_plans(self, plans: AnyPlans) -> Self:
-        """Return a mixer for different plans that shares the networks: training one also trains the other."""
+        """Return a mixer for another set of plans that shares the networks: training one also trains the other."""
         other = type(self)(**{**self.config, "plans": plans, "text_encoder": self.text_encoder})
         return in_mode_of(self, other.to(self.index.device))
 

@@ -158,7 +158,7 @@ class NamedParts(RenamedInputs, TensorDictSequential):
         return super().forward(*args, **kwargs)
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
-        """Convert a module to the part ``name``; a plain module gets the keys of the part that it replaces."""
+        """Wrap a module as the part ``name``; a plain module gets the keys of the part that it replaces."""
         before = self.module[name]
         if not isinstance(module, TensorDictModuleBase):
             return TensorDictModule(module, in_keys=before.in_keys[:1], out_keys=before.out_keys)
@@ -245,7 +245,7 @@ def trunk_attributes(trunk: TensorDictSequential) -> tuple[Any, Any, Layout]:
     """Return ``(plans, tasks, layout)`` of a trunk's first part with a layout; missing plans or tasks are None."""
     part = next((part for part in _named_parts(trunk) if hasattr(part, "layout")), None)
     if part is None:
-        raise ValueError("trunk must have a part with a layout: PlanAttention, SkillMixer, TaskLatent or features")
+        raise ValueError("trunk must have a part with a layout, such as PlanAttention, SkillMixer or TaskLatent")
     return getattr(part, "plans", None), getattr(part, "tasks", None), part.layout
 
 

@@ -130,7 +130,7 @@ class ConditionedActor(NamedParts):
         return action_spec(written[0] if len(written) == 1 else "action", self.layout)
 
     def with_plans(self, plans: AnyPlans) -> Self:
-        """Return an actor that follows different plans but shares the networks: training one also trains the other."""
+        """Return an actor for another set of plans that shares the networks: training one also trains the other."""
         parts = {name: follow(part, plans) for name, part in self.module.items()}
         decoder = parts.pop("decoder")
         return in_mode_of(self, self.rebuild(TensorDictSequential(OrderedDict(parts)), decoder))
@@ -299,6 +299,6 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         return TensorDictSequential(OrderedDict([*self.module.items()][:-2]))
 
     def with_plans(self, plans: Any) -> StochasticActor:
-        """Return a policy that follows different plans but shares the networks: training one also trains the other."""
+        """Return a policy for another set of plans that shares the networks: training one also trains the other."""
         options: dict[str, Any] = {**self.config, "trunk": follow(self.trunk, plans)}
         return in_mode_of(self, StochasticActor(**options))

@@ -92,7 +92,7 @@ def draws(actor: Any) -> bool:
 
 
 def with_plans(actor: Any, plans: AnyPlans) -> Any:
-    """Return an actor that follows different plans but shares the networks: training one also trains the other.
+    """Return an actor for another set of plans that shares the networks: training one also trains the other.
 
     Raises:
         TypeError: the actor follows no plans, or cannot follow other plans.

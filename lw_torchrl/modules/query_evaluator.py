@@ -128,7 +128,7 @@ class QueryEvaluator(TensorDictModuleBase):
         return None
 
     def with_plans(self, plans: AnyPlans) -> QueryEvaluator:
-        """Return an evaluator for different plans that shares the weights; raise RuntimeError if these do not fit."""
+        """Return an evaluator for another set of plans with the same weights; raise RuntimeError if they do not fit."""
         options: dict[str, Any] = dict(self.config)
         if "text_encoder" in signature(type(self)).parameters:
             options["text_encoder"] = self.text_encoder

@@ -82,7 +82,7 @@ class _RelativePositions(Features):
         return {"plans": self.plans, "noise": self.noise, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
 
     def with_plans(self, plans: AnyPlans) -> Any:
-        """Return the same features for different plans."""
+        """Return the same features for another set of plans."""
         return type(self)(**{**self.config, "plans": plans}).to(self.offset.device).train(self.training)
 
     def positions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
@@ -234,8 +234,8 @@ class RoleFeatures(_RelativePositions):
         self._sharing = WeakSet([self])
 
     def with_plans(self, plans: AnyPlans) -> RoleFeatures:
-        """Return features for different plans. For tasks that both sets of plans contain, the two modules always share
-        their contact points, even if one module is fitted later."""
+        """Return these features for another set of plans. For tasks in both sets, the two modules always share their
+        contact points, even if one module is fitted later."""
         other: RoleFeatures = super().with_plans(plans)
         other._sharing = self._sharing
         other._sharing.add(other)

@@ -137,7 +137,7 @@ class DecidedGripper(_ActionWrapper):
         return action if self.training else decided(action, self.action_layout, self.closes_above)
 
     def with_plans(self, plans: AnyPlans) -> DecidedGripper:
-        """Return a policy that follows different plans but shares the networks; the action layout stays the same."""
+        """Return a policy for another set of plans that shares the networks; the action layout stays the same."""
         return in_mode_of(self, DecidedGripper(**{**self.config, "actor": with_plans(self.actor, plans)}))
 
 
@@ -204,7 +204,7 @@ class DemonstratedActor(_Wrapper):
         return write(tensordict, self, [outputs.get(key) for key in self.others.out_keys])
 
     def with_plans(self, plans: AnyPlans) -> TensorDictModuleBase:
-        """Return a policy for different plans; for plans of another suite, return only ``others``."""
+        """Return a policy for another set of plans; for plans of another suite, return only ``others``."""
         others: TensorDictModuleBase = with_plans(self.others, plans)
         if layout_of(others) != self.layout:  # no task of that suite was demonstrated
             return others
@@ -273,7 +273,7 @@ class TransferredActor(_ActionWrapper):
         return decided(result, new) if new.binary_gripper else result
 
     def with_plans(self, plans: AnyPlans) -> TransferredActor:
-        """Return a policy that follows different plans but shares the networks."""
+        """Return a policy for another set of plans that shares the networks."""
         other = {"actor": with_plans(self.actor, plans), "plans": plans}
         return in_mode_of(self, TransferredActor(**{**self.config, **other}))
 

@@ -129,7 +129,7 @@ def read_reply(
 
 
 def _storable(text: str) -> str:
-    r"""Normalize a text for storage in a file: no lone surrogates, no byte order mark, and "\n" as line end."""
+    r"""Normalize a text for storage in a file: no lone surrogates, no byte order mark, and "\n" as the line ending."""
     text = text.encode("utf-8", "replace").decode()
     return text.replace("\r\n", "\n").replace("\r", "\n").lstrip("\ufeff")
 
@@ -208,7 +208,7 @@ def _answers_in_lines(file: Path) -> Iterator[tuple[str, _Place, str]]:
         check_choice(f"{where}: format", row["format"], PLAN_FORMATS)
         name = folder_name(row["llm"])
         if models.setdefault(name, row["llm"]) != row["llm"]:
-            raise ValueError(f"{where}: models {models[name]!r} and {row['llm']!r} have the same folder name {name!r}")
+            raise ValueError(f"{where}: models {models[name]!r} and {row['llm']!r} would have the same folder {name!r}")
         yield name, (row["format"], row["task"], row["attempt"]), row["completion"]
 
 

@@ -123,7 +123,7 @@ def log_lanes(
 
 
 def _log_active_step(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, kind: str = "") -> None:
-    """Log the active plan step (1-based) as a lane; ``kind`` is a prefix that distinguishes two logged plans."""
+    """Log the active plan step (1-based) as a timeline lane; the prefix ``kind`` distinguishes two logged plans."""
     assert episode.active is not None
     count = max(len(episode.steps), int(episode.active.max()) + 1)
     labels = [f"{i} {skill}" for i, (_, skill) in enumerate(episode.steps, 1)] or map(str, range(1, count + 1))
@@ -136,7 +136,7 @@ def _log_active_step(stream: Any, lanes: Lanes, name: str, episode: RecordedEpis
 
 @dataclass(frozen=True)
 class Page:
-    """The data of an episode from which the page's views are built; a page can be written as JSON."""
+    """The data of one episode, from which the views of its page are built; it can be written as JSON."""
 
     root: str
     trails: Collection[str]  # entities that are shown up to the time cursor

@@ -37,12 +37,12 @@ class RolloutRecorder(Transform):
     Args:
         logger: the logger of the recording.
         rows: indices of the environment rows to record.
-        plans: the plans whose conditions are evaluated in ``qaf``, one for the task of each row; None for no plans.
+        plans: the plans whose conditions are evaluated in ``qaf``, one for the task of each row; None without plans.
         every: record the first and then every N-th episode of a row.
         policy: the policy's name, shown in the tab of a LanguageWorldEnv's episode.
         objects: for other environments, a function that maps a rollout (T,) to the objects to draw: name -> T×3
             positions in metres.
-        task: for other environments, the task's name; None for the name of the environment's class.
+        task: for other environments, the task's name; None uses the name of the environment's class.
 
     Raises:
         ValueError: a row is not in the environment, ``plans`` has no plan for a row's task, or a transform before the

@@ -25,7 +25,7 @@ _SWITCHED_OFF = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECT
 
 
 def _open_gl() -> Any:
-    """Open a windowless OpenGL context with the library in MUJOCO_GL (if unset: EGL when there is no display)."""
+    """Open a windowless OpenGL context with the backend that MUJOCO_GL names; if unset and without a display, EGL."""
     # MuJoCo reads MUJOCO_GL when it is imported, but robosuite sets the variable after that import.
     headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     backend = os.environ.get("MUJOCO_GL", "").lower().strip() or ("egl" if headless else "")

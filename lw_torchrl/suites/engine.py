@@ -1,7 +1,7 @@
 """The engine interface: a batched simulator behind :class:`~lw_torchrl.envs.LanguageWorldEnv`.
 
-An engine simulates N rows, each of a fixed task, without TorchRL. Observations are float64, as in Meta-World; the
-environment converts them to float32, counts time steps and truncates episodes.
+An engine simulates N environment rows, each of a fixed task, and does not use TorchRL. Observations are float64, as in
+Meta-World; the environment converts them to float32, counts time steps and truncates episodes.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ class _StateQueries:
 
     def rows(self, drawn: TensorDictBase) -> TensorDictBase:
         """Return ``observation`` (B, 39) float32, ``clauses`` (B, 1) and the clauses' ``truth`` (B, 1) float32 for a
-        result of :meth:`draw`, on the device of that result."""
+        batch from :meth:`draw`, on the device of the batch."""
         truth, clauses = drawn["truth"][:, None].float(), self.clauses.pick(drawn["clause"][:, None])
         return TensorDict(observation=self.observation[drawn["row"]], truth=truth, clauses=_as_tensordict(clauses))
 

@@ -49,7 +49,7 @@ def make_optimizer(
 
 
 def _rate_factor(config: Any, step: int) -> float:
-    """Return the learning rate after ``step`` optimizer steps as a fraction of the initial one: a cosine to 0, or 1."""
+    """Return the factor of the learning rate after ``step`` optimizer steps: 1, or on a cosine schedule from 1 to 0."""
     if getattr(config, "schedule", "cosine") == "constant":
         return 1.0
     return 0.5 * (1.0 + math.cos(math.pi * step / config.steps))

@@ -132,7 +132,7 @@ class QAFTransform(KeepsEnvState):
         self._task: Tensor | None = None  # the task of each row since its last reset
 
     def with_plans(self, plans: AnyPlans) -> QAFTransform:
-        """Return a transform that answers the conditions of different plans."""
+        """Return a transform that answers the conditions of another set of plans."""
         return QAFTransform(plans, in_keys=self.in_keys, out_keys=self.out_keys[:1])
 
     def _write(self, tensordict: TensorDictBase, task_id: Tensor, before: Tensor | None = None) -> None:
@@ -274,7 +274,7 @@ class CorruptQAF(EpisodeTransform):
         self._answers: Tensor | None = None  # (B, places, S); the n-th update is at place n % places
 
     def with_plans(self, plans: AnyPlans) -> CorruptQAF:
-        """Return a transform that corrupts the answers of different plans in the same way."""
+        """Return a transform that corrupts the answers of another set of plans in the same way."""
         options = {name: getattr(self, name) for name in ("every", "delay", "flip", "seed", "in_keys")}
         return CorruptQAF(plans, **options)
 

@@ -74,7 +74,7 @@ def test_broken_lines(tmp_path):
         ("[" * 10**5, "line 2: the line is not JSON"),
         (json.dumps({**ROW, "attempt": "0"}), "line 2: an answer needs the fields llm"),
         (json.dumps({**ROW, "format": "chain"}), "line 2: format must be one of"),
-        (json.dumps({**ROW, "llm": "PaLM/2"}), "same folder name 'PaLM_2'"),
+        (json.dumps({**ROW, "llm": "PaLM/2"}), "same folder 'PaLM_2'"),
     ):
         (tmp_path / "answers.jsonl").write_text(json.dumps({**ROW, "llm": "PaLM_2"}) + "\n" + line)
         with pytest.raises(ValueError, match=message):

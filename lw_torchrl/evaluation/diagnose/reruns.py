@@ -77,7 +77,7 @@ class Settings:
 
 @dataclass
 class Reruns:
-    """Re-runs of failed episodes with the settings of the original run, and with parts replaced."""
+    """Re-runs of failed episodes with the settings of the original run, but with parts of the policy replaced."""
 
     settings: Settings
     reference: Plans | None

@@ -130,7 +130,7 @@ def mentions(value: Any, names: Collection[str]) -> bool:
 
 
 def is_facts(value: Any) -> bool:
-    """Return whether an object states facts: {"near": ["gripper", "mug"], "gripper": "closed"}."""
+    """Return whether a JSON object states facts: {"near": ["gripper", "mug"], "gripper": "closed"}."""
     return isinstance(value, dict) and all(
         (is_noun(str(key)) and (isinstance(each, dict) or is_predicate(str(each))))
         or (is_predicate(str(key)) and isinstance(each, list) and len(each) > 1)

@@ -465,7 +465,7 @@ class Tree:
         return text in self.definitions and text not in self.opened
 
     def is_unknown(self, value: Any) -> bool:
-        """Return whether a value is a text without any meaning for the plan."""
+        """Return whether a value is a string that says nothing about the plan."""
         return isinstance(value, str) and not is_told(value) and value not in self.definitions
 
     def field(self, key: str, value: Any, role: str, hint: str, join: str) -> Node | None:

@@ -151,8 +151,8 @@ its count is zero, so this value silences all warnings; any other count means th
 
 
 class TaskProgram:
-    """A mixin that separates a Meta-World environment from its simulator state. One program is built for each model and
-    task. Every episode runs on a shallow copy (:meth:`on`), which shares everything except the state."""
+    """A mixin that separates a Meta-World environment from its simulator state. One environment is built for each
+    model and task. Every episode runs on a shallow copy (:meth:`on`), which shares everything except the state."""
 
     model: Any
     data: Any

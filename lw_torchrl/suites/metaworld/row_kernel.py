@@ -34,8 +34,8 @@ _int32, _int64 = types.int32, types.int64
 
 
 def _function(library: ctypes.CDLL, name: str, result: Any, *arguments: Any) -> Any:
-    """Return a function of a C library for use in compiled code. A missing function raises an AttributeError here;
-    Numba would end the process later."""
+    """Return a function of a C library for use in compiled code. Raise an AttributeError if the function is missing,
+    because Numba would crash the process later."""
     llvmlite.binding.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
     return types.ExternalFunction(name, result(*arguments))
 
