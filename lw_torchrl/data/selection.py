@@ -45,7 +45,7 @@ class EpisodeFilter:
     else_best: Probability | None = None
 
     def choose(self, parts: Sequence[Demonstrations], returns: Sequence[Tensor]) -> list[Demonstrations]:
-        """Return datasets with only the kept episodes, given the return and length (E, 2) of each dataset's episodes."""
+        """Return parts with only the kept episodes, given the return and length (E, 2) of the parts' episodes."""
         labels = {part.config.behaviour for part in parts}
         for label in self.behaviours or ():
             check_choice("keep: behaviours", label, sorted(labels))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._util.files import read_toml
-from lw_torchrl.language.expressions import evaluate, leaves
+from lw_torchrl.language.expressions import Expression, Once, fold
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import GRIPPER, Coordinate
 from lw_torchrl.language.plans import PlanStep
@@ -62,6 +62,7 @@ def coverage_of(task: Task, steps: Sequence[PlanStep]) -> float:
 
 # The typical states are synthetic: objects and goal at fixed positions, and the hand at offsets from the touched point.
 _Floats = NDArray[np.float32]
+_Bools = NDArray[np.bool_]
 _OBJECTS = ((0.0, 0.6, 0.02), (0.2, 0.7, 0.02), (-0.2, 0.7, 0.02), (0.0, 0.8, 0.02))
 _GOAL = (0.1, 0.8, 0.2)
 _MOTIONS = read_toml(files("lw_torchrl.language") / "data" / "motions.toml", ValueError)
@@ -79,16 +80,17 @@ def _active(
     task: Task, point: str, motion: str, steps: Sequence[tuple[Query, Verb]]
 ) -> Iterator[tuple[set[Verb], set[str]]]:
     """Yield, for each typical state, the verbs of the active steps and the right verbs."""
-    for offset, opening, lift, verbs in _TYPICAL[motion]:
-        state = _state(task, point, offset, opening, lift)
-        yield {verb for query, verb in steps if _holds(query, task, state)}, verbs
+    states = np.stack([_state(task, point, *row[:3]) for row in _TYPICAL[motion]])
+    truths = [(_holds(query, task, states), verb) for query, verb in steps]
+    for number, (*_, verbs) in enumerate(_TYPICAL[motion]):
+        yield {verb for truth, verb in truths if truth[number]}, verbs
 
 
 def true_around(task: Task, point: str, conditions: Sequence[Query]) -> Iterator[set[int]]:
     """Yield the indices of the true conditions for each of several hand positions around a point."""
-    for (x, y), z, opening in product(*_AROUND):
-        state = _state(task, point, (x, y, z), opening, 0.0)
-        yield {number for number, query in enumerate(conditions) if _holds(query, task, state)}
+    states = np.stack([_state(task, point, (x, y, z), opening, 0.0) for (x, y), z, opening in product(*_AROUND)])
+    truths = [_holds(query, task, states) for query in conditions]
+    yield from ({number for number, truth in enumerate(truths) if truth[at]} for at in range(len(states)))
 
 
 def moves_before_grasp(task: Task, steps: Sequence[PlanStep]) -> bool:
@@ -109,7 +111,7 @@ def _state(task: Task, point: str, offset: Sequence[float], opening: float, lift
     state[layout.positions[-1]] = _GOAL
     if at := [number for number in touched.position if isinstance(number, int)]:
         state[at[-1]] += np.float32(lift)
-    hand = _position(touched.position, state) + _floats(touched.offset) + _floats(offset)
+    hand = _position(touched.position, state[None])[0] + _floats(touched.offset) + _floats(offset)
     state[list(places(layout.positions[0]))] = hand
     state[layout.opening] = opening
     return state
@@ -119,32 +121,42 @@ def _floats(numbers: Sequence[float]) -> _Floats:
     return np.array(numbers, np.float32)
 
 
-def _position(position: Sequence[Coordinate], state: _Floats) -> _Floats:
-    """Return the coordinates (3,) of a named position in a state, in metres."""
-    return _floats([state[at] if isinstance(at, int) else at for at in position])
+def _position(position: Sequence[Coordinate], states: _Floats) -> _Floats:
+    """Return the coordinates (S, 3) of a named position in states (S, n), in metres."""
+    columns = [states[:, at] if isinstance(at, int) else np.full(len(states), at, np.float32) for at in position]
+    return np.stack(columns, 1)
 
 
-def _holds(query: Query, task: Task, state: _Floats) -> bool:
-    if query.is_conjunction:  # much faster, since all() stops at the first false clause
-        return all(_is_true(clause, task, state) for clause in query.clauses)
-    return evaluate(query.expression, {leaf: _is_true(leaf, task, state) for leaf in leaves(query.expression)})
+def _holds(query: Query, task: Task, states: _Floats) -> _Bools:
+    """Evaluate a query in states (S, n); a latch has the truth of its condition."""
+
+    def visit(each: Expression, parts: list[_Bools]) -> _Bools:
+        if each.kind == "leaf":
+            is_latch = isinstance(each.leaf, Once)
+            truth = fold(each.leaf.condition, visit) if is_latch else _is_true(each.leaf, task, states)
+            return truth ^ each.negated
+        truths: _Bools = np.reshape(parts, (-1, len(states)))  # also without parts
+        joined: _Bools = np.all(truths, axis=0) if each.kind == "all" else np.any(truths, axis=0)
+        return joined
+
+    return fold(query.expression, visit)
 
 
-def _is_true(clause: Clause, task: Task, state: _Floats) -> bool:
+def _is_true(clause: Clause, task: Task, states: _Floats) -> _Bools:
     """Evaluate a clause without torch, with the same precision and order of operations as QueryProgram."""
-    second, shift = _floats((0.0, 0.0, 0.0)), np.zeros(3)
+    second, shift = np.zeros((1, 3), np.float32), np.zeros(3)
     if clause.predicate in STATES:
-        first = _floats((0.0, 0.0, state[task.openings[clause.subject]]))
+        first = _position((0.0, 0.0, task.openings[clause.subject]), states)
     else:
         subject = task.object(clause.subject)
-        first, shift = _position(subject.position, state), np.array(subject.offset)
+        first, shift = _position(subject.position, states), np.array(subject.offset)
         if clause.object is not None:
             other = task.object(clause.object)
-            second, shift = _position(other.position, state), shift - other.offset
-    truth = True
+            second, shift = _position(other.position, states), shift - other.offset
+    truth = np.full(len(states), True)
     for part in comparisons(clause.predicate, task.layout):
         d = first - second + _floats(shift + np.array((0.0, 0.0, part.raise_z)))
-        d = d[["xyz".index(axis) for axis in part.axes]]
-        value, threshold = np.sqrt((d * d).sum()) if part.length else d[0], np.float32(part.threshold)
-        truth &= bool({"<": value < threshold, ">": value > threshold, "<=": value <= threshold}[part.sense])
-    return truth != clause.negated
+        d = d[:, ["xyz".index(axis) for axis in part.axes]]
+        value, threshold = np.sqrt((d * d).sum(1)) if part.length else d[:, 0], np.float32(part.threshold)
+        truth &= {"<": value < threshold, ">": value > threshold, "<=": value <= threshold}[part.sense]
+    return truth ^ clause.negated

@@ -88,7 +88,8 @@ PREDICATES.maps = [STATES, _OF_POSITION, RELATIONS]  # type: ignore[list-item]
 
 def comparisons(predicate: str, layout: Layout) -> tuple[Comparison, ...]:
     """Return the comparisons of a predicate, with the threshold of ``layout`` if it sets one for the predicate."""
-    parts = PREDICATES[predicate]
+    table = next((table for table in PREDICATES.maps if predicate in table), PREDICATES)  # a failed lookup is slow
+    parts = table[predicate]
     if (threshold := layout.thresholds.get(predicate)) is None:
         return parts
     if len(parts) != 1:

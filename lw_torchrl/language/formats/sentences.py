@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 
 from lw_torchrl._util.checks import shown
 from lw_torchrl.language.formats.base import END, PROGRAM_WORDS, Reading, Section, is_verb
@@ -126,6 +127,7 @@ def _arrow_rule(line: str) -> str:
     return f"{line[:start]}if {state}: {action}"
 
 
+@lru_cache(maxsize=4096)
 def usual_words(text: str) -> str:
     """Rewrite phrases that the parser of clauses does not know."""
     for pattern, plain in _REWRITINGS:
