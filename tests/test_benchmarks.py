@@ -101,7 +101,7 @@ def test_truth_writes_a_table_and_a_figure_and_resumes(tmp_path, monkeypatch, ca
     file = tmp_path / "untrained.safetensors"
     lw.save_actor(lw.PlanConditionedActor(plans), file)
     args = truth.Arguments(
-        policy=(file,), tasks=("push", "reach"), every=(1, 4), flip=(0.0, 0.5), episodes=2, max_steps=30, out=tmp_path,
+        policy=(file,), tasks=("push", "reach"), every=(1, 4), flip=(0.0, 0.5), episodes=1, max_steps=10, out=tmp_path,
     )  # fmt: skip
     truth.main(args)
     table = (tmp_path / "table.md").read_text("utf-8")

@@ -8,6 +8,7 @@ import shlex
 import shutil
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,7 @@ PARTS = sorted((EXAMPLES / "parts").glob("*.py"))
 EXTENDING = sorted((EXAMPLES / "extending").glob("my_*.py"))
 RUNS = read_cases("examples.toml")
 PRINTS, SAYS = RUNS.pop("parts"), RUNS.pop("extending")
+LESS = {"train": ["--batch-size", "20"], "evaluate": ["--max-steps", "20"]}
 TABLES = (METHODS, RELATIONS, SUITES, lw.PLAN_FORMATS)
 
 
@@ -48,7 +50,21 @@ def run(folder, *command):
     return done.stdout
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "train_bc.py" else pytest.mark.slow) for n in RUNS])
+@pytest.mark.filterwarnings("ignore:.*WARN:UserWarning")
+def test_the_training_loop_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["train_bc.py", *RUNS["train_bc.py"]["options"].split()])
+    for name, steps in (("collect_demonstrations", 200), ("evaluate", 40)):
+        monkeypatch.setattr(lw, name, partial(getattr(lw, name), max_steps=steps))
+    runpy.run_path(str(EXAMPLES / "train_bc.py"), run_name="__main__")
+    output = capsys.readouterr().out
+    assert [pattern for pattern in RUNS["train_bc.py"]["output"] if not re.search(pattern, output, re.MULTILINE)] == []
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in RUNS if name != "train_bc.py"])
 def test_example_runs(name, tmp_path):
     if name in ("any_environment.py", "fetch_few_shot.py"):
         pytest.importorskip("gymnasium_robotics")
@@ -122,10 +138,13 @@ def test_programs_have_at_most_15_lines_use_public_names_and_run(path, tmp_path,
     monkeypatch.setattr(sys, "argv", [str(path)])
     runpy.run_path(str(path), run_name="__main__")
     assert PRINTS[path.stem] in capsys.readouterr().out
-    if path.stem == "custom_decoder":  # its policy is loaded in a new process
+    if path.stem == "custom_decoder":  # its policy is loaded by another program, with a class of its own
         loads = [text for text in map(ast.unparse, statements(path)) if "save_actor(" not in text]
         assert len(loads) == len(statements(path)) - 1
-        assert PRINTS[path.stem] in run(tmp_path, "-c", "\n".join(loads))
+        Path("loads.py").write_text("\n".join(loads), "utf-8")
+        decoder = runpy.run_path("loads.py", run_name="__main__")["Decoder"]
+        assert PRINTS[path.stem] in capsys.readouterr().out
+        assert type(lw.load_actor("custom_decoder.safetensors", parts=[decoder]).decoder.network) is decoder
 
 
 def commands(path):
@@ -159,12 +178,13 @@ def test_commands_of_examples_run(path, tables, tmp_path, monkeypatch, capsys):
         if file.is_file():
             shutil.copy(file, tmp_path)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(lw, "collect_demonstrations", partial(lw.collect_demonstrations, max_steps=120))
     for line in commands(path):
         words = shlex.split(line)[1:]
         for option, least in {"--steps": 3, "--episodes": 1}.items():
             if option in words:
                 words[words.index(option) + 1] = str(least)
-        main([*words, *(["--batch-size", "20"] if words[0] == "train" else [])])
+        main([*words, *LESS.get(words[0], [])])
     printed = capsys.readouterr()
     for part in SAYS[path.name]:
         assert part in printed.out + printed.err

@@ -145,11 +145,11 @@ def in_blocks(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[T
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         n = tensordict.batch_size[0]
-        padding = -n % size
-        padded = torch.cat([tensordict, tensordict[:1].expand(padding)]) if padding else tensordict
-        outputs = [policy(block.copy()) for block in padded.split(size)]
+        rows = torch.arange(n + -n % size, device=tensordict.device).clamp(max=n - 1)  # the last row fills the block
+        padded = tensordict[rows] if n % size else tensordict
+        outputs = [policy(block.copy()) for block in (padded.split(size) if n > size else [padded])]
         if not isinstance(outputs[0], TensorDictBase):
             raise TypeError(f"policy must return its input TensorDict, got {type(outputs[0]).__name__}")
-        return tensordict.update(torch.cat(outputs)[:n])
+        return tensordict.update((torch.cat(outputs) if n > size else outputs[0])[:n])
 
     return run

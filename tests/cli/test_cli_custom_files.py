@@ -36,7 +36,8 @@ def work_in_the_folder(own, monkeypatch):
 
 def test_scripted_skills_carry_out_a_custom_plan(capsys, tmp_path):
     files = ("--plans", "reach.plan", "--skill-file", "skills.toml", "--task-file", "tasks.toml")
-    printed = run(capsys, "evaluate", "scripted", *files, "--episodes", 3, "--noise", 0, "--out", tmp_path / "out")
+    options = ("--episodes", 3, "--max-steps", 120, "--noise", 0, "--out", tmp_path / "out")
+    printed = run(capsys, "evaluate", "scripted", *files, *options)
     assert "reach: success 1.00" in printed
     assert "go to the ball" in printed
     assert len(json.loads((tmp_path / "out" / "results.json").read_text())["origin"]["plans"]) == 32
@@ -49,7 +50,7 @@ def test_a_policy_is_trained_with_custom_files(capsys, tmp_path):
     files = ("--plans", "reach.plan", "--task-file", "tasks.toml", "--text-encoder", "my_texts:encode")
     run(capsys, "train", "demos", "--out", policy, "--tasks", "reach", *files, *TINY, "--batch-size", 8)
     assert "text_encoder must be the encoder" in fails(capsys, "evaluate", policy, "--text-encoder", "my_texts:other")
-    few = ("--text-encoder", "my_texts:encode", "--episodes", 1, "--stop-at-success")
+    few = ("--text-encoder", "my_texts:encode", "--episodes", 1, "--max-steps", 20)
     run(capsys, "evaluate", policy, *few, "--out", tmp_path / "out")
     saved = json.loads((tmp_path / "out" / "results.json").read_text())
     assert saved["origin"]["checkpoint"]["path"] == str(policy)

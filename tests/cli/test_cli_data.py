@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import statistics
+from functools import partial
 
 import numpy as np
 import pytest
@@ -92,13 +93,14 @@ def test_a_dataset_is_exported_and_imported(capsys, datasets, tmp_path):
     assert "lerobot" in fails(capsys, "data", "export", datasets[0].root, "--to", "lerobto", "--out", tmp_path / "x")
 
 
-def test_collect_by_experts_and_by_a_policy(capsys, tmp_path):
+def test_collect_by_experts_and_by_a_policy(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(lw, "collect_demonstrations", partial(lw.collect_demonstrations, max_steps=100))
     args = ("reach", "--episodes", 2, "--out", tmp_path / "demos", "--noise", 0, 0.1)
     shown = document(capsys, "collect", *args)
-    assert (shown["tasks"], shown["steps"]) == ([{"task": "reach", "success": 1.0, "episodes_run": 2}], 1000)
+    assert (shown["tasks"], shown["steps"]) == ([{"task": "reach", "success": 1.0, "episodes_run": 2}], 200)
     config = lw.LanguageWorldExperienceReplay(tmp_path / "demos").demonstrations.config
     assert (config.tasks, config.episodes_per_task, config.noise_scale) == (("reach",), 2, (0.0, 0.1))
-    assert "1000 steps in" in run(capsys, "collect", *args), "nothing is left to do"
+    assert "200 steps in" in run(capsys, "collect", *args), "nothing is left to do"
     assert "another configuration" in fails(capsys, "collect", "push", *args[1:])
     torch.manual_seed(0)
     policy = tmp_path / "tiny.safetensors"

@@ -88,13 +88,12 @@ def test_exit_status_depends_on_the_error(capsys, monkeypatch, error, status):
         main([])
 
 
-def test_a_closed_pipe_is_status_141_and_version_is_printed():
+def test_a_closed_pipe_is_status_141_and_version_is_printed(capsys):
     for command in ("--help", "tasks", "tasks --json"):
         script = f"'{sys.executable}' -m lw_torchrl {command} | true; exit ${{PIPESTATUS[0]}}"
         done = subprocess.run(["bash", "-c", script], capture_output=True, timeout=120)
         assert (done.returncode, done.stderr) == (141, b"")
-    version = subprocess.run([sys.executable, "-m", "lw_torchrl", "--version"], capture_output=True, timeout=120)
-    assert version.stdout.decode() == f"lw-torchrl {lw_torchrl.__version__}\n"
+    assert run(capsys, "--version") == f"lw-torchrl {lw_torchrl.__version__}\n"
 
 
 def test_import_runs_a_module_first(capsys, tmp_path, monkeypatch):

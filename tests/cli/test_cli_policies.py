@@ -5,6 +5,8 @@ import re
 import signal
 import time
 from dataclasses import replace
+from functools import partial
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -25,7 +27,8 @@ LONG = ("--max-steps", 120, "--seed", 1000)
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
     root = tmp_path_factory.mktemp("cli") / "demos"
-    main(["collect", "push", "reach", "--out", str(root), "--episodes", "1", "--noise", "0", "0.1"])
+    with patch.object(lw, "collect_demonstrations", partial(lw.collect_demonstrations, max_steps=60)):
+        main(["collect", "push", "reach", "--out", str(root), "--episodes", "1", "--noise", "0", "0.1"])
     return root
 
 
@@ -81,7 +84,7 @@ def test_the_baseline_is_trained_and_evaluated(capsys, demos, tmp_path):
 
 def test_evaluate_writes_result_figure_and_recording(capsys, policy, tmp_path):
     out = tmp_path / "runs"
-    args = ("evaluate", policy, "--tasks", "push", "reach", "--episodes", 1, "--seed", 7, "--max-steps", 60)
+    args = ("evaluate", policy, "--tasks", "push", "reach", "--episodes", 1, "--seed", 7, "--max-steps", 20)
     printed = run(capsys, *args, "--attribute", "--reference", "MT10", "--out", out)
     assert files_in(out) == {"results.json", "success.png", "failures.png", "rollout.rrd"}
     result = lw.EvaluationResult.load(out / "results.json")
@@ -91,7 +94,7 @@ def test_evaluate_writes_result_figure_and_recording(capsys, policy, tmp_path):
     origin = json.loads((out / "results.json").read_text())["origin"]
     assert origin["checkpoint"]["path"] == str(policy)
     actor = lw.load_actor(policy)
-    again = lw.evaluate(actor, tasks=["push", "reach"], episodes_per_task=1, seed=7, max_steps=60, progress=False)
+    again = lw.evaluate(actor, tasks=["push", "reach"], episodes_per_task=1, seed=7, max_steps=20, progress=False)
     assert again.episodes == result.episodes
     assert f"written to {out}; rollout.rrd shows the failed episodes push 0, reach 0" in printed
     recorded = document(capsys, "info", out / "rollout.rrd")["episodes"]
@@ -126,7 +129,7 @@ def test_experts_and_scripted_plans_are_evaluated(capsys, tmp_path):
     shown = document(capsys, "evaluate", "expert", "--tasks", "reach", "--episodes", 2, "--stop-at-success")
     assert shown["mean_success"] == 1.0
     out = tmp_path / "scripted"
-    args = ("scripted", "--tasks", "reach", "push", "--episodes", 2, "--noise", 0, "--out", out)
+    args = ("scripted", "--tasks", "reach", "push", "--episodes", 2, "--noise", 0, "--max-steps", 120, "--out", out)
     printed = run(capsys, "evaluate", *args)
     assert "push: success 1.00\n    true " in printed
     assert "close the gripper around the puck" in printed
@@ -226,7 +229,7 @@ def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
 @pytest.mark.parametrize("who", ["random", "wrong"])
 def test_a_random_policy_is_reproducible(capsys, tmp_path, who):
     out = ("--out", tmp_path / "x.rrd")
-    documents = [document(capsys, "record", "push", "--policy", who, *LONG, *out) for _ in range(2)]
+    documents = [document(capsys, "record", "push", "--policy", who, "--max-steps", 40, *out) for _ in range(2)]
     assert documents[0] == documents[1]
     assert documents[0]["episodes"][0]["first_success"] is None
 
@@ -269,7 +272,7 @@ def test_custom_policies_and_evaluators_are_recorded(capsys, tmp_path, monkeypat
     lw.save_actor(lw.PlanConditionedActor(reach, decoder=lw.modules.MLPDecoder(width=8)), "mine.safetensors")
     for policy in ("scripted", "mine.safetensors"):
         for evaluator in ("evaluator.safetensors", "my_parts:never", "my_parts:Never"):
-            options = ("--policy", policy, "--evaluator", evaluator, "--max-steps", 20, "--out", "x.rrd")
+            options = ("--policy", policy, "--evaluator", evaluator, "--max-steps", 5, "--out", "x.rrd")
             assert "reach, episode 0" in run(capsys, "record", "reach", *options)
     wrong = ("record", "reach", "--policy", "scripted", "--evaluator", "my_parts:number")
     assert "--evaluator my_parts:number" in fails(capsys, *wrong)

@@ -19,7 +19,7 @@ from lw_torchrl.evaluation.diagnose.states import Motion, last_stay_start, stall
 from lw_torchrl.record.rollouts import simulate_again
 from lw_torchrl.transforms.qaf import plan_program
 
-TASK, SEED, STEPS = "drawer-open", 7, 80
+TASK, SEED, STEPS = "drawer-open", 7, 70
 PLANS = lw.Plans({TASK: lw.load_plans("MT10")[TASK]})
 PROGRAM = plan_program(PLANS)
 PAIRS = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
@@ -68,8 +68,20 @@ class WrongEvaluator(lw.QueryEvaluator):
         return 10.0 * answers.float() - 5.0
 
 
-def test_a_faulty_skill_is_found_with_its_step():
-    [failure] = evaluated(faulty_skill(), reference=REFERENCE).failures
+@pytest.fixture(scope="module")
+def skill_failures():
+    """The failures of two episodes, run together."""
+    return evaluated(faulty_skill(), episodes=2, reference=REFERENCE).failures
+
+
+@pytest.fixture(scope="module")
+def plan_failure():
+    [failure] = evaluated(lw.ScriptedSkillActor(faulty_plans()), reference=REFERENCE).failures
+    return failure
+
+
+def test_a_faulty_skill_is_found_with_its_step(skill_failures):
+    failure = skill_failures[0]
     assert (failure.cause, failure.also, failure.step) == ("skill", None, 1)
     assert failure.counterfactuals == {"no noise": False, "policy": True, "skill": True}
     skill = "lower the gripper around the drawer handle"
@@ -101,7 +113,7 @@ class Weak(lw.ScriptedSkillActor):
 def test_a_motion_that_is_wrong_in_all_steps_is_not_a_skills_fault(step, cause):
     """Only one step moves far on that axis, so a script in that step repairs either fault."""
     plans = lw.Plans({"plate-slide-side": lw.load_plans("MT50")["plate-slide-side"]})
-    [failure] = evaluated(Weak(plans, step), tasks="plate-slide-side", max_steps=120).failures
+    [failure] = evaluated(Weak(plans, step), tasks="plate-slide-side").failures
     assert failure.cause == cause
     assert failure.counterfactuals[cause] is True
     assert failure.finding.kind == ("policy's action" if step is None else "distant step")
@@ -150,8 +162,8 @@ def test_noise_is_told_from_a_fault():
     assert motion(lambda action: action + torch.randn(60, 3, generator=generator)).extent()[2] == "irregular"
 
 
-def test_a_faulty_plan_is_found_with_its_step():
-    [failure] = evaluated(lw.ScriptedSkillActor(faulty_plans()), reference=REFERENCE).failures
+def test_a_faulty_plan_is_found_with_its_step(plan_failure):
+    failure = plan_failure
     assert (failure.cause, failure.step) == ("plan", 1)
     assert failure.counterfactuals == {"no noise": False, "plan": True}  # its skills are the scripts: none is replaced
     assert (failure.finding.kind, failure.finding.values["step"]) == ("plan departs", 1)
@@ -221,11 +233,12 @@ def test_a_networks_skills_are_replaced_and_its_mode_stays(wrapped):
     assert [module.training for module in actor.modules()] == modes
 
 
-@pytest.mark.parametrize("is_canonical", [False, True])
-def test_a_plan_that_is_not_understood_is_never_called_sound(is_canonical):
+@pytest.mark.parametrize(("is_canonical", "max_steps"), [(False, 100), (True, 80)])
+def test_a_plan_that_is_not_understood_is_never_called_sound(is_canonical, max_steps):
     pairs = [("gripper is not near the drawer handle", "dance a waltz"), ("gripper is near the drawer handle", "bow")]
     plans = lw.canonical_plans(plans_of(pairs)) if is_canonical else plans_of(pairs)
-    [failure] = evaluated(still(plans, text_encoder=lambda texts: torch.ones(len(texts), 3)), max_steps=120).failures
+    actor = still(plans, text_encoder=lambda texts: torch.ones(len(texts), 3))
+    [failure] = evaluated(actor, max_steps=max_steps).failures
     assert failure.succeeds_at is not None
     assert "(Meta-World's expert in 2 steps without a scripted skill) the same episode succeeds" in failure.why
     unsound = ", and the expert does not follow the plan, so this does not show that the plan is sound"
@@ -271,11 +284,9 @@ def test_a_policy_may_complete_the_reference():
     assert len(failure.mended.plan.steps) == failure.mended.steps["skill_weights"].shape[1] == 4
 
 
-def test_failures_do_not_depend_on_the_number_of_environments():
-    actor = faulty_skill()
-    result = evaluated(actor, episodes=2, reference=REFERENCE)
-    assert evaluated(actor, episodes=2, reference=REFERENCE, num_envs=1).failures == result.failures
-    assert [failure.episode for failure in result.failures] == [0, 1]
+def test_failures_do_not_depend_on_the_number_of_environments(skill_failures):
+    assert evaluated(faulty_skill(), episodes=2, reference=REFERENCE, num_envs=1).failures == skill_failures
+    assert [failure.episode for failure in skill_failures] == [0, 1]
 
 
 @pytest.mark.parametrize("name", DECISIONS)
@@ -343,16 +354,15 @@ def test_without_failed_episodes_there_are_no_failures():
     assert (result.failures, result.success_once) == ((), {TASK: 1.0})
 
 
-def test_the_repaired_episode_is_kept_and_can_be_simulated_again():
-    [failure] = evaluated(lw.ScriptedSkillActor(faulty_plans()), reference=REFERENCE).failures
-    mended = failure.mended
+def test_the_repaired_episode_is_kept_and_can_be_simulated_again(plan_failure):
+    mended = plan_failure.mended
     assert (mended.by, mended.plan) == ("plan", REFERENCE[TASK])
     success = mended.steps["next", "success"].flatten().tolist()
     assert success == [False] * (len(success) - 1) + [True]
     assert mended.steps["qaf"].shape == mended.steps["skill_weights"].shape == (len(success), 3)
     shown = [mended.steps[key].numpy() for key in ("action", "observation")]
     assert simulate_again(TASK, SEED, 0, *shown) is not None, "bit for bit"
-    assert "mended" not in failure.to_json()
+    assert "mended" not in plan_failure.to_json()
 
 
 def test_plans_with_memory_are_diagnosed():

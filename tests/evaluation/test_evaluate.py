@@ -111,21 +111,15 @@ def assert_equal_in_metaworld(result):
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A policy that sometimes opens drawers."""
-    root, options = tmp_path_factory.mktemp("demos") / "demos", {"max_steps": 150, "progress": False}
-    lw.collect_demonstrations(["drawer-open", "reach"], episodes_per_task=4, root=root, noise_scale=(0, 0.2), **options)
-    parts = {"sampler": lw.TaskBalancedSampler(), "transform": lw.QAFTransform(PLANS)}
-    replay, actor = lw.LanguageWorldExperienceReplay(root, after_success=20, **parts), make_actor()
-    config = lw.BehavioralCloningConfig(steps=400, batch_size=100)
-    lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
-    return actor
+def trained():
+    """The shipped policy, which reaches in 75 steps, but does not open drawers."""
+    return lw.load_actor("few-shot-mt50")
 
 
 @pytest.fixture(scope="module")
 def whole(trained):
     """The trained policy's evaluation, with whole episodes."""
-    return run(trained, ["drawer-open", "reach"], episodes_per_task=4, max_steps=150, num_envs=6)
+    return run(trained, ["drawer-open", "reach"], episodes_per_task=4, max_steps=75, num_envs=6)
 
 
 @pytest.mark.slow
@@ -144,13 +138,13 @@ def test_the_experts_actions_succeed_equally_in_metaworlds_own_environments():
 
 @pytest.mark.parametrize("num_envs", [None, pytest.param(3, marks=pytest.mark.slow)])
 def test_stopping_at_success_does_not_change_the_success_rate(trained, whole, num_envs):
-    options = dict(episodes_per_task=4, max_steps=150, stop_at_success=True, num_envs=num_envs)
+    options = dict(episodes_per_task=4, max_steps=75, stop_at_success=True, num_envs=num_envs)
     stopped = run(trained, ["drawer-open", "reach"], **options)
     for e, other in zip(stopped.episodes, whole.episodes, strict=True):
         unknown = {"success_at_end": None, "episode_return": None}
         assert e == replace(other, **unknown)
-        assert torch.equal(e.actions, other.actions[: e.first_success or 150])
-    assert any(e.success for e in whole.episodes)
+        assert torch.equal(e.actions, other.actions[: e.first_success or 75])
+    assert {e.success for e in whole.episodes} == {True, False}
     if num_envs is not None:
         assert_equal_in_metaworld(stopped)
 

@@ -13,7 +13,7 @@ from lw_torchrl.evaluation.diagnose.reruns import difference
 
 TASK, SEED = "drawer-open", 7
 PLANS = lw.Plans({TASK: lw.load_plans("MT10")[TASK]})
-RUN = {"seed": SEED, "max_steps": 80, "num_threads": 1, "progress": False}
+RUN = {"seed": SEED, "max_steps": 70, "num_threads": 1, "progress": False}
 RECORDED = ["observation", "task_id", "qaf", "skill_weights"]
 
 

@@ -113,5 +113,12 @@ def test_faulty_json_is_refused(rows, message):
 
 
 def test_the_types_can_be_imported_first(python):
-    for module in ("plans", "formats", "plan_files", "plan_decoding"):
-        assert python(f"import lw_torchrl.language.{module}").returncode == 0
+    program = """
+import importlib, sys
+for module in ("plans", "formats", "plan_files", "plan_decoding"):
+    for name in [name for name in sys.modules if name.startswith("lw_torchrl")]:
+        del sys.modules[name]
+    importlib.import_module(f"lw_torchrl.language.{module}")
+"""
+    done = python(program)
+    assert done.returncode == 0, done.stderr

@@ -1,5 +1,7 @@
 """Fixtures of the tests of planners."""
 
+import ssl
+
 import pytest
 from fake_server import serving
 
@@ -14,9 +16,17 @@ def _no_account(monkeypatch):
     monkeypatch.setenv("NO_PROXY", "*")
 
 
+@pytest.fixture(scope="session")
+def certificates():
+    """Load this machine's certificates once, which takes 50 ms."""
+    return ssl.create_default_context()
+
+
 @pytest.fixture
-def ask(tmp_path):
-    """Ask a server for plans; replies are cached in the test's folder."""
+def ask(tmp_path, monkeypatch, certificates):
+    """Ask a server for plans, and again at once after a failure; replies are cached in the test's folder."""
+    monkeypatch.setattr("ssl.create_default_context", lambda: certificates)
+    monkeypatch.setattr("openai._base_client.INITIAL_RETRY_DELAY", 0.001)
 
     def ask(server, tasks="MT10", *, format="chain_py", attempts=1, out=None, **options):
         options = {"cache": tmp_path / "kept", "retries": 1, "timeout": 20.0, **options}

@@ -107,19 +107,19 @@ FAILURES |= {
 @pytest.mark.parametrize("name", FAILURES)
 def test_a_failure_is_a_clear_error_and_the_other_answers_are_kept(ask, name):
     failure, cause = FAILURES[name]
-    bad, slow = lw.MT10[4], "answer within" in cause
+    tasks, bad, slow = lw.MT10[3:6], lw.MT10[4], "answer within" in cause
     server = FakeServer(lambda body: failure if asked_for(body) == bad else shipped(body))
     began = time.monotonic()
     with pytest.raises(PlannerError, match=rf"^'a/model' at http://127.0.0.1.*{bad}, attempt 0: .*{cause}") as caught:
-        ask(server, concurrency=1, timeout=0.4 if slow else 20.0)
+        ask(server, tasks, concurrency=1, timeout=0.4 if slow else 20.0)
     assert time.monotonic() - began < 10
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 1000
-    kept = 4 if caught.value.fatal else 9
-    assert f"{kept} of 10 answers are cached" in str(caught.value)
+    kept = 1 if caught.value.fatal else 2
+    assert f"{kept} of 3 answers are cached" in str(caught.value)
     working = FakeServer()
-    assert len(ask(working, concurrency=1)) == 10
-    assert len(working.requests) == 10 - kept
+    assert len(ask(working, tasks, concurrency=1)) == 3
+    assert len(working.requests) == 3 - kept
 
 
 TEMPORARY = [error(429, "slow down"), error(503, "busy"), Failure(200, completion("x"), cut=True)]

@@ -1,6 +1,7 @@
 """try_plan and repair_plans: a plan runs in the simulator, and its model reads how it fared."""
 
 from contextlib import contextmanager
+from functools import partial
 
 import pytest
 from fake_server import PLANS, FakeServer, asked_for, completion, serving, shipped
@@ -23,6 +24,12 @@ def plan_with(task, change):
     """Return the shipped plan of a task after a change of its (condition, skill) pairs."""
     pairs = [(str(step.condition), step.skill) for step in PLANS[task].steps]
     return lw.ConditionalPlan.from_pairs(task, change(pairs))
+
+
+@pytest.fixture(autouse=True)
+def _short_episodes(monkeypatch):
+    """End an episode in which a plan fails after 100 steps; plans that succeed take fewer."""
+    monkeypatch.setattr("lw_torchrl.planners.repairing.evaluate", partial(lw.evaluate, max_steps=100))
 
 
 @pytest.fixture

@@ -151,12 +151,10 @@ PICTURES = {"cameras": ("corner", "corner3"), "height": 24, "width": 24}
 SEEING = lw.training.ImageQueryEvaluatorConfig(steps=6, batch_size=8, checkpoint_every=2, held_out_pairs=0.0)
 
 
-@pytest.fixture(scope="module")
-def seen(tmp_path_factory):
+def with_pictures(root, **options):
     if missing := why_no_pictures():
         pytest.skip(missing)
-    root = tmp_path_factory.mktemp("states") / "demos"
-    lw.collect_demonstrations([*TWO], episodes_per_task=3, root=root, max_steps=60, progress=False)
+    lw.collect_demonstrations([*TWO], root=root, progress=False, **options)
     lw.data.add_pictures(root, **PICTURES, every=5, progress=False)
     replay = lw.LanguageWorldExperienceReplay(root, label="executed")
     replay.add_column("pixels", lw.data.load_pictures(replay, **PICTURES, every=5))
@@ -164,7 +162,8 @@ def seen(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_it_learns_positions_and_answers(seen):
+def test_it_learns_positions_and_answers(tmp_path):
+    seen = with_pictures(tmp_path / "demos", episodes_per_task=3, max_steps=60)
     config = replace(SEEING, steps=900, batch_size=16, learning_rate=3e-3, held_out_states=0.0)
     data = lw.training.LabelledQueries(seen, config)
 
@@ -185,10 +184,11 @@ def test_it_learns_positions_and_answers(seen):
         assert (hand - true).norm(dim=-1).median() < 0.6 * (true.mean(0) - true).norm(dim=-1).median()
 
 
-def test_only_states_with_their_own_picture_are_used(seen):
+def test_only_states_with_their_own_picture_are_used(tmp_path):
+    seen = with_pictures(tmp_path / "demos", episodes_per_task=2, max_steps=40)
     data = lw.training.LabelledQueries(seen, SEEING)
     states = sum(len(queries.observation) for part in ("training", "states") for queries in data.parts[part])
-    assert states == 2 * 3 * 12  # tasks, episodes, 60 steps at 5 apart
+    assert states == 2 * 2 * 8  # tasks, episodes, 40 steps at 5 apart
     sparse = lw.LanguageWorldExperienceReplay(seen.root, label="executed")
     pictures = lw.data.load_pictures(sparse, **PICTURES, every=5)
     sparse.add_column("pixels", pictures[torch.arange(len(sparse)) // 20 * 20])

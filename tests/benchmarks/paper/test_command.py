@@ -11,6 +11,7 @@ from benchmarks.figures import plot_sorted_tasks
 from benchmarks.paper import recipes, runs, schedule
 from benchmarks.paper.__main__ import main
 from benchmarks.paper.comparison import MethodComparison
+from benchmarks.paper.imitation import ImitationRun
 from benchmarks.paper.published import published, published_curves
 from benchmarks.paper.recipes import PRESETS, DataSetting, Member
 from benchmarks.paper.schedule import run_commands
@@ -91,6 +92,7 @@ def test_with_jobs_each_run_is_a_command(capsys, tmp_path, monkeypatch):
 
     monkeypatch.setattr(schedule, "run_command", pretend)
     monkeypatch.setattr(runs, "evaluate", partial(lw.evaluate, max_steps=20))
+    monkeypatch.setattr(ImitationRun, "scope", ("push", "reach"))
     given = ["scripted", "--seeds", "0", "1", "--episodes", "1", "--jobs", "2", "--out", str(tmp_path)]
     assert "| scripted |" in run(capsys, *given)
     assert sorted(commands) == [[*given, "--run", f"scripted/seed{seed}"] for seed in (0, 1)]

@@ -18,12 +18,14 @@ from benchmarks.paper.stacked import StackedBehavioralCloning
 from lw_torchrl.modules import Concat, FocusFeatures, MLPDecoder, ObservationFeatures, plans_of
 from lw_torchrl.transforms import SwapUnmentioned
 
-PLANS = lw.load_plans("MT50")
+MT10 = lw.load_plans("MT10")
+TASKS = ("push", "reach", "window-open")
+PLANS = lw.Plans([MT10[task] for task in TASKS])
 TINY = DataSetting("tiny", "reach", 2)
 TINY_ONE_SHOT = DataSetting("tiny-one-shot", "reach", 2, targets="push")
 FOCUS = {"focus": True, "canonical": True, "swap_unmentioned": 0.5}
 MEMBER = Member({"features": "differences", "width": 32, "depth": 1}, FOCUS)
-TRAINING = lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20)
+TRAINING = lw.BehavioralCloningConfig(steps=30, batch_size=20, checkpoint_every=10)
 PARTS = {"target": Execution("target", (0.0,)), "members": (MEMBER,), "training": TRAINING}
 PRESET = replace(PRESETS["strong"]["few-shot"], **PARTS)
 ROLES = {"features": "opening", "roles": True, "jitter": 0.03, "any_yaw": True}
@@ -88,8 +90,8 @@ def test_finished_run_is_not_repeated(undisturbed, run, monkeypatch):
     assert not list((undisturbed / run.folder).glob("checkpoint*"))
 
 
-STOPS = [(TINY_ONE_SHOT, PRESET, 46, 66), (TINY, ENSEMBLE, 106, 126), (TINY, WATCHED, 57, 61)]
-STOPS += [pytest.param(TINY_ONE_SHOT, ENSEMBLE, 106, 126, marks=pytest.mark.slow)]
+STOPS = [(TINY_ONE_SHOT, PRESET, 23, 33), (TINY, ENSEMBLE, 53, 63), (TINY, WATCHED, 29, 31)]
+STOPS += [pytest.param(TINY_ONE_SHOT, ENSEMBLE, 53, 63, marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize(("setting", "preset", "stop", "steps"), STOPS)
@@ -110,14 +112,12 @@ def test_every_recipe_loads_and_makes_its_policies(name):
         for member in (*preset.members, *preset.demonstrated):
             for method in ("pcbc", "dc"):
                 parts = member.of(method)
-                actor = parts.actor(method, parts.seen(lw.load_plans("MT10")))
+                actor = parts.actor(method, parts.seen(PLANS))
                 assert (plans_of(actor) is None) == (method == "dc")
                 assert parts.transform(actor) is not None
         assert ImitationRun(SETTINGS[setting], "pcbc", 0, preset).describe(PLANS)["training"]
 
 
-TASKS = ("push", "reach", "window-open")
-MT10 = lw.load_plans("MT10")
 HUNDRED = lw.BehavioralCloningConfig(steps=100, batch_size=30, seed=5)
 
 

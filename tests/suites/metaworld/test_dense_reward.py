@@ -70,7 +70,21 @@ def read(row: SimulatedRow) -> np.ndarray:
     return sensors
 
 
-def construct_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.ndarray:
+INVENTED = [at.OBJECT, at.SECOND, at.PLACE, at.HAND, at.RIGHT_TIP, at.LEFT_TIP, at.RIGHT_PAD, at.LEFT_PAD]
+INVENTED += [at.RIGHT_CLAW, at.LEFT_CLAW, at.JOINT, at.QUATERNION]
+
+
+def invented_numbers(row: SimulatedRow) -> list[np.ndarray | None]:
+    """Return the indices of the numbers to invent; None if the task lacks the sensor, or the sensor is constant."""
+    view = StateView(row._model, row._data)
+    world = [*view.find("body world"), *view.find("quaternion of body world")]
+    indices = [row._sensor_index[columns] for columns in INVENTED]
+    return [None if np.isin(index, world).any() else index for index in indices]
+
+
+def construct_states(
+    engine: VectorizedEngine, numbers: list[list[np.ndarray | None]], rng: np.random.Generator
+) -> np.ndarray:
     """Put the hand, objects and joints of every row where formulas change: at, near and far from the object, the start,
     the goal and other points. Return actions."""
     for number, row in enumerate(engine._rows):
@@ -101,26 +115,23 @@ def construct_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.n
         pads = rng.choice([0.02, 0.03, 0.08]) * rng.random(2)
         opening = rng.choice([0.0, 0.033, 0.043, 0.05, 0.055]) * rng.choice([0.995, 1.005])
         opening = rng.choice([opening, rng.uniform(0, 0.12)])
-        view = StateView(row._model, row._data)
-        world = [*view.find("body world"), *view.find("quaternion of body world")]
         ideal = [[0.707, 0, 0, 0.707], [1, 0, 0, 0]][rng.integers(2)]
         invented = [
-            (at.OBJECT, thing - row.sources.offset),
-            (at.SECOND, second - row.sources.second_offset),
-            (at.PLACE, near(place)),
-            (at.HAND, near(beside(tips, 0, 0, 0.04))),
-            (at.RIGHT_TIP, beside(tips, 0, -0.02, 0)),
-            (at.LEFT_TIP, beside(tips, 0, 0.02, 0)),
-            (at.RIGHT_PAD, beside(tips, 0, -pads[0], 0)),
-            (at.LEFT_PAD, beside(tips, 0, pads[1], 0)),
-            (at.RIGHT_CLAW, beside(tips, 0, opening, 0)),
-            (at.LEFT_CLAW, tips),
-            (at.JOINT, rng.choice([0.1, rng.uniform(-0.1, 0.1), rng.uniform(-2, 1.6)])),
-            (at.QUATERNION, ideal + rng.choice([0.0, 0.01, 0.2]) * rng.normal(size=4)),
+            thing - row.sources.offset,
+            second - row.sources.second_offset,
+            near(place),
+            near(beside(tips, 0, 0, 0.04)),
+            beside(tips, 0, -0.02, 0),
+            beside(tips, 0, 0.02, 0),
+            beside(tips, 0, -pads[0], 0),
+            beside(tips, 0, pads[1], 0),
+            beside(tips, 0, opening, 0),
+            tips,
+            rng.choice([0.1, rng.uniform(-0.1, 0.1), rng.uniform(-2, 1.6)]),
+            ideal + rng.choice([0.0, 0.01, 0.2]) * rng.normal(size=4),
         ]
-        for columns, value in invented:
-            index = row._sensor_index[columns]
-            if not np.isin(index, world).any():  # a task lacks this sensor, or the sensor is constant
+        for index, value in zip(numbers[number], invented, strict=True):
+            if index is not None:
                 row._numbers[index] = value
     n = len(engine._rows)
     action = rng.uniform(-1, 1, (n, 4))
@@ -137,8 +148,9 @@ def test_formulas_have_metaworlds_bits_in_constructed_states():
     rewards = DenseReward(engine._starts, np.arange(n))
     compared, full, wrong = np.zeros(n, int), np.zeros(n, int), defaultdict(list)
     seen_rewards = [set() for _ in TASKS]
+    numbers = [invented_numbers(row) for row in engine._rows]
     for trial in range(200):
-        action = construct_states(engine, rng).astype([np.float32, np.float64][trial % 2])
+        action = construct_states(engine, numbers, rng).astype([np.float32, np.float64][trial % 2])
         sensors = np.stack([read(row) for row in engine._rows])
         current = observer.observe(sensors)
         observation = np.concatenate((current, current, engine._goal), axis=1)
