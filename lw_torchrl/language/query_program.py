@@ -137,7 +137,7 @@ class QueryProgram(nn.Module):
         needed = (*ids, self.num_latches)
         got = None if latches is None else (latches.dtype, tuple(latches.shape))
         if self.num_latches and got != (torch.bool, needed):
-            raise ValueError(f"latches must be bool of shape {needed} for queries about earlier steps, got {got}")
+            raise ValueError(f"latches must be bool of shape {needed}, for queries about earlier steps, got {got}")
         if (kernel := self._kernel(observation, task_id, latches)) is not None:
             return self._answer(kernel, observation, task_id, latches)
         check_finite("observation", observation)
