@@ -23,6 +23,7 @@ from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import CAUSES, attribute_failures
 
+NATURAL = lw.load_plans("MT50")
 REFERENCE = Path(__file__).parent / "data" / "attribution_plans.json"
 BUILT_ON = (
     *("button-press-topdown", "drawer-open", "push", "plate-slide-back", "plate-slide-side", "handle-press-side"),
@@ -216,7 +217,7 @@ def failures_of(fault: Fault, policy: str, args: Arguments, learned: Any, refere
         if found >= min(_ENOUGH, args.at_most):
             return
         start = perf_counter()
-        sound = lw.Plans({task: lw.load_plans("MT50")[task] for task in args.tasks})
+        sound = lw.Plans({task: NATURAL[task] for task in args.tasks})
         cast = Cast(sound, policy == "scripted", sound)
         fault.plant(cast, step)
         actor, failed = cast.actor(learned), []
@@ -255,7 +256,7 @@ def train(args: Arguments) -> Any:
     if file.is_file():
         return lw.load_actor(file)
     tasks = dict.fromkeys((*BUILT_ON, *TASKS, *args.tasks))
-    plans = lw.Plans({task: lw.load_plans("MT50")[task] for task in tasks})
+    plans = lw.Plans({task: NATURAL[task] for task in tasks})
     how: dict[str, Any] = {"policy": "scripted", "seed": 0, "noise_scale": (0.05, 0.1, 0.2), "max_steps": 150}
     collect_demonstrations(list(plans), episodes_per_task=10, root=data, progress=False, **how)
     sampler = lw.TaskBalancedSampler(exact=True)
