@@ -7,7 +7,6 @@ import json
 import pkgutil
 import re
 import warnings
-from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -85,13 +84,9 @@ SLOW = [pytest.param(page, marks=pytest.mark.slow) for page in WITH_CODE if page
 
 
 @pytest.mark.parametrize("page", [*(page for page in WITH_CODE if page.name in FAST_PAGES), *SLOW], ids=page_name)
-def test_code_of_a_page_runs(page, monkeypatch):
+def test_code_of_a_page_runs(page):
     namespace = {"__name__": "__main__"}
     for line, kind, code in blocks(page):
-        if page.name == "README.md":  # with fewer training steps, and fewer and shorter episodes
-            for name in ("collect_demonstrations", "evaluate"):
-                monkeypatch.setattr(lw_torchrl, name, partial(getattr(lw_torchrl, name), max_steps=120))
-            code = re.sub(r"episodes_per_task=\d+", "episodes_per_task=1", code.replace("steps=500", "steps=20"))
         if "PixelRenderTransform" in code and why_no_pictures():
             continue
         if kind == "pycon":

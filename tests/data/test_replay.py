@@ -227,7 +227,7 @@ def test_values_of_other_rows_are_errors(both):
     replay, ahead, turned = (open_replay(roots, "n steps") for roots in (both, both, both[::-1]))
     replay.add_column("advantage", numbered(ahead), of=ahead)
     assert len(turned) == len(replay)
-    with pytest.raises(ValueError, match="must hold this buffer.s rows"):
+    with pytest.raises(ValueError, match="must hold this buffer's rows"):
         replay.add_column("other", numbered(turned), of=turned)
 
 
