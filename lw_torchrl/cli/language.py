@@ -250,7 +250,7 @@ _MARKS = {True: "ok", False: "OFF", None: "note"}
 
 
 def _check_suite(output: Output, name: str) -> Output:
-    """Measure each task of a suite in simulation and compare the results with the suite's layout."""
+    """Run :func:`lw_torchrl.suites.check_suite`, and print what it measured in simulation and what it expected."""
     suite = options.read_suite(name)
     assert suite is not None
     rows = lw.suites.check_suite(suite)

@@ -45,7 +45,7 @@ class Output:
         self._document: dict[str, Any] = {}
 
     def show(self, key: str, value: Any, text: str | None = None) -> Output:
-        """Print ``text``, if there is any, or add ``value`` to the JSON document; return this object."""
+        """Print ``text`` unless it is None; with --json, add ``value`` to the JSON document instead. Return self."""
         if self.as_json:
             self._document[key] = value
         elif text is not None:
@@ -271,7 +271,7 @@ def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[s
 
 
 def read_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> Plans:
-    """Load the plans named by --plans. If ``tasks`` are from another suite, MT10 and MT50 mean that suite's plans."""
+    """Load the plans named by --plans. If ``tasks`` are not Meta-World's, MT10 and MT50 mean their suite's plans."""
     return Plans(find_plans(sources, tasks))
 
 

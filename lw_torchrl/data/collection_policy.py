@@ -60,7 +60,7 @@ class Behaviour:
         if not self.name.strip() or not self.name.isprintable():
             raise ValueError(f"behaviour: name must be a printable label, got {shown(self.name)}")
         if self.shortest > self.longest:
-            raise ValueError(f"behaviour: longest must be at least shortest, {self.shortest}, got {self.longest}")
+            raise ValueError(f"behaviour: longest must be at least shortest ({self.shortest}), got {self.longest}")
 
     @property
     def acts(self) -> Behaviour:

@@ -96,7 +96,7 @@ class EpisodeCounter:
 
 
 def _with_ids(method: Callable[..., Any], change: Callable[..., Tensor] = lambda ids, *_args, **_kwargs: ids) -> Any:
-    """Wrap a method of Categorical that returns a new spec; the new spec gets the task ids, changed by ``change``."""
+    """Wrap a method of Categorical that returns a new spec; the new spec keeps the task ids, changed by ``change``."""
 
     def wrapped(self: TaskIds, *args: Any, **kwargs: Any) -> TaskIds:
         spec = method(self, *args, **kwargs)

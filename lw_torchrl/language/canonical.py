@@ -27,7 +27,7 @@ from lw_torchrl.language.tasks import (
 )
 
 MIN_COVERAGE = 0.75
-"""The minimum fraction of typical states that a plan must cover to keep its own conditions."""
+"""The fraction of typical states that a plan must cover at least to keep its own conditions."""
 Source = Literal["plan", "completed", "fallback"]
 SOURCES = {"plan": "its own steps", "completed": "completed", "fallback": "replaced by the fallback plan"}
 """A short description, for printing, of each source of a canonical plan's steps."""

@@ -53,7 +53,7 @@ class Expression(NamedTuple):
 
     @property
     def leaf(self) -> Any:
-        """The value of a leaf, without its negation."""
+        """The value of a leaf before its negation."""
         return self.node.leaf
 
     @property

@@ -14,7 +14,7 @@ from lw_torchrl._util.registry import ReadOnlyDict
 @typed_fields
 @dataclass(frozen=True)
 class Slot:
-    """The numbers of an observation that describe one object."""
+    """The entries of an observation that describe one object."""
 
     position: Natural  # index of the x coordinate; y and z follow
     quaternion: Natural | None = None  # index of the first of four numbers; None without an orientation

@@ -75,7 +75,7 @@ def _implies(parts: _Parts, other: Expression, levels: int = 2) -> bool:
 
 
 def _arrange(steps: Sequence[tuple[int, _Parts]], depth: int, lines: list[Line]) -> None:
-    """Append the outline of steps, pairs of an index and the parts of the step's guard that no line above states."""
+    """Append the outline of steps. Each step is an index and those parts of its guard that no line above states."""
     excluded = list[Expression]()  # the negations of the preceding branches, as long as "else" can follow
     at = 0
     while at < len(steps):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import lru_cache
 from itertools import groupby
 from typing import NamedTuple
 
@@ -63,6 +64,7 @@ class Affirmed(NamedTuple):
     is_read: bool  # False if the part has a negation whose meaning is unknown
 
 
+@lru_cache(maxsize=512)
 def plain_negations(text: str) -> str:
     """Rewrite the negations of a condition with "not", "and not" and "unless".
 

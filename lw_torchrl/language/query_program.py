@@ -230,7 +230,7 @@ class QueryProgram(nn.Module):
         return evaluate_gates(atoms, Gates(tables.inputs, tables.negated, self._shapes), truth)
 
     def _values(self, observation: Tensor, tables: QueryTables, floor: float = 0.0) -> Tensor:
-        """Return each atom's value (B, A) in metres; ``floor`` bounds lengths from below, since 0 has no gradient."""
+        """Return each atom's value (B, A) in metres; ``floor`` is the least length, since 0 has no gradient."""
         numbers = torch.cat((observation.reshape(-1, self.layout.size), tables.constants), 1)
         d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1)) + tables.shift
         x, y, z = d.unbind(1)

@@ -119,7 +119,7 @@ class ChatClient:
         raise PlannerError(f"{self.model!r} at {self.address}, {question}: {self._without_key(what)}.", fatal=fatal)
 
     def _complete(self, request: Mapping[str, Any]) -> tuple[bytes, frozenset[str]]:
-        """Send a request; return the reply's body and the fallbacks with which the server accepted the request."""
+        """Send a request; return the reply's body, and the fallbacks that the server needed to accept it."""
         while True:  # at most one iteration per fallback, since rejecting an active fallback raises
             fallbacks = self._fallbacks
             try:
@@ -177,7 +177,7 @@ class ChatClient:
         return f" (set in the environment: {', '.join(names)}{ignored})" if names else ""
 
     def _without_key(self, text: Any) -> Any:
-        """Redact the API key in a text or in bytes, except a key of under 8 characters, which may be a common word."""
+        """Redact the API key in text or bytes. A key of under 8 characters is kept, since it may be a common word."""
         key, hidden = self._key, "(the key)"
         if len(key) < 8:
             return text

@@ -107,7 +107,7 @@ class Files:
             raise Refused(f"{name} declares {size / 1e6:,.0f} MB or more, which is too much for files of this size")
 
     def choose(self, column: str, fits: Mapping[str, bool]) -> str | None:
-        """Choose the column in the files from which to read a dataset's ``column``: the first known name that
+        """Return the name of the file column that holds the dataset's ``column``: the first known name that
         ``fits``, or None."""
         present = [name for name in NAMES[column] if name in fits]
         if fitting := [name for name in present if fits[name]]:
@@ -244,7 +244,7 @@ def _find_episodes(
 ) -> Array:
     """Find the length and the tasks of each episode, and return the order (R,) of the rows by episode and time.
 
-    ``file`` (R,) is the number of each row's file, and ``is_episode`` whether each file's name is that of an episode.
+    ``file`` (R,) is the number of each row's file, and ``is_episode`` is true for files that are named as episodes.
     """
     rows, listed, names = len(file), _listed(meta, "episodes"), _listed(meta, "tasks")
     frame = read.get("frame_index", np.zeros(rows, np.int64))

@@ -164,7 +164,8 @@ class Control(nn.Module):
     def _watching(self, true: Tensor, truth: Tensor) -> Iterator[tuple[list[tuple[Tensor, Tensor]], list[Tensor]]]:
         """Record each innermost policy's observations and actions, and the answers of query evaluators.
 
-        With ``correct``, policies receive the observation ``true``; with ``answer``, evaluators return ``truth``.
+        If ``correct``, the policies receive the observation ``true`` instead of their own. If ``answer``, the
+        evaluators return the answers ``truth``.
         """
         calls: list[tuple[Tensor, Tensor]] = []
         answers: list[Tensor] = []

@@ -331,7 +331,7 @@ class _Scope(Expressions):
         return [action(joined(parts), node.lineno, goal)]
 
     def is_action(self, node: ast.Call) -> bool:
-        """Return whether a call is a skill: a method of the robot, or a function whose first word is a verb."""
+        """Return whether a call is a skill: a method of the robot, or a function whose name begins with a verb."""
         root, dot, _ = ast.unparse(node.func).removeprefix("self.").partition(".")
         is_skill = is_verb(words_of(name_of(node.func))[:1])
         return is_carrier(node) or (root in PYTHON["robots"] or (is_skill and is_owner(root)) if dot else is_skill)

@@ -213,7 +213,7 @@ class LineParser:
         return guard != test and str(guard).replace(" not ", " ") == str(test).replace(" not ", " ")
 
     def trail(self, test: Expression, is_exception: bool) -> None:
-        """Guard the last actions with the condition after them."""
+        """Make the last actions depend on the condition after them."""
         choice = Choice([(test, [part for _, part in self.acts])])
         self.replace(self.acts, choice)
         self.opens.append(Open(choice, [*self.scopes], is_exception=is_exception))

@@ -159,7 +159,7 @@ def _plain(copula: str) -> str:
 
 
 def _explained(text: str) -> str:
-    """Replace words with their explanation: "the puck is in the gripper (the gripper is near the puck and closed)"."""
+    """Replace words by the explanation in parentheses after them, as in "the puck is held (the gripper is closed)"."""
     text = re.sub(r"\s?\(((?!not\b|no\b|never\b)[^()]*)\)", lambda each: each[0] if _is_known(each[1]) else "", text)
     inside = re.search(r"\w\s*\(([^()]*)\)", text)
     if inside is None or re.search(r"\b(?:not|or|and|is|are|unless)$", text[: inside.start() + 1], re.IGNORECASE):

@@ -1,4 +1,4 @@
-"""A reader of programs in JSON and YAML, by structure and content; the keys are only hints.
+"""A parser of programs in JSON and YAML, which goes by structure and content; the keys are only hints.
 
 A text that states something about the scene is a condition, and a text that begins with a verb is an action. An object
 with conditions and actions is a branch, and a list with branches is a choice.

@@ -134,7 +134,7 @@ def _yaml(text: str) -> Any:
     import yaml  # type: ignore[import-untyped]
 
     class Loader(getattr(yaml, "CBaseLoader", yaml.BaseLoader)):  # type: ignore[misc]
-        """A loader that reads "!selector [...]" as {"selector": [...]}."""
+        """A YAML loader that reads the tag "!selector [...]" as {"selector": [...]}."""
 
     def tagged(loader: Any, tag: str, node: Any) -> dict[str, Any]:
         if isinstance(node, yaml.ScalarNode):

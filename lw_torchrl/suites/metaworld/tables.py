@@ -14,7 +14,7 @@ Vector = tuple[float, float, float]
 Pair = tuple[float, float]
 
 NO_OFFSET: Vector = (-0.0, -0.0, -0.0)
-"""An offset that changes no number, bit for bit: adding 0.0 would turn -0.0 into 0.0."""
+"""An offset of -0.0, which leaves every number bit-identical; adding 0.0 would turn -0.0 into 0.0."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Funnel:
 
 @dataclass(frozen=True)
 class Held:
-    """The conditions for an object to count as held (by default always); data/rewards.toml explains the fields."""
+    """The conditions for an object to count as held, by default always true; data/rewards.toml explains the fields."""
 
     near: float = inf
     within: float = inf
