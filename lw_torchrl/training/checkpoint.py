@@ -195,7 +195,7 @@ def _copy_tensors(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> N
 
 def not_finite(weights: Mapping[str, Tensor]) -> list[str]:
     """Return the names of the weights that hold NaN or infinity."""
-    return [name for name, tensor in weights.items() if not finite(tensor)]
+    return [name for name, tensor in weights.items() if not tensor.isfinite().all()]
 
 
 def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
