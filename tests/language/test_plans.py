@@ -187,7 +187,7 @@ def test_plans_queries_and_answers_do_without_torch(python):
     program = """
 import sys, numpy as np, lw_torchrl as lw, lw_torchrl.language.canonical
 from lw_torchrl.language.nearest import nearest_query
-plans = lw.canonical_plans(lw.load_plans("MT10"), fallback=True)
+plans = lw.canonical_plans(lw.load_plans("MT50"), fallback=True)
 assert lw.Plans.from_json(plans.to_json()) == plans
 assert lw.parse_query("the gripper above the puck", "push") == nearest_query("gripper over the puck", "push").query
 assert lw.decode_plan(lw.encode_plan(lw.load_plans("MT10")["push"], "chain_py"), "push", "chain_py").all_scripted

@@ -36,6 +36,7 @@ def parts(schema):
 def test_the_schema_uses_only_keywords_that_servers_support(format):
     for task in lw.MT50 if PLAN_FORMATS[format].style.goals else lw.MT10:
         schema = plan_schema(task, format)
+        VALIDATOR.check_schema(schema)
         inner = list(parts(schema))
         assert {name for part in inner for name in part} <= {
             "type", "properties", "required", "additionalProperties", "items", "minItems", "maxItems", "anyOf", "enum",
@@ -47,8 +48,7 @@ def test_the_schema_uses_only_keywords_that_servers_support(format):
                 assert part["required"] == list(part["properties"]) == sorted(part["properties"])
         assert sum(len(part.get("enum", ())) for part in inner) <= 350
         assert len(json.dumps(schema)) < 16_000
-    for free in (False, True):
-        VALIDATOR.check_schema(plan_schema("stick-pull", format, free_skills=free))
+    VALIDATOR.check_schema(plan_schema("stick-pull", format, free_skills=True))
 
 
 @pytest.mark.parametrize("format", FORMATS)

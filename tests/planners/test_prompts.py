@@ -12,13 +12,13 @@ MOST_TOKENS = 2_200  # a token for every three characters
 PLANS = {skills: lw.load_plans("MT50", skills=skills) for skills in ("own", "MT10")}
 
 
-@pytest.mark.parametrize(("first", "format"), list(enumerate(lw.PLAN_FORMATS)))
-def test_a_prompt_is_short_and_lacks_the_task_s_own_plan(first, format):
+@pytest.mark.parametrize("format", lw.PLAN_FORMATS)
+def test_a_prompt_is_short_and_lacks_the_task_s_own_plan(format):
     for number, task in enumerate(lw.MT50):
-        vocabulary = number % 8 < 4
+        vocabulary = number % 2 == 0
         prompt = lw.planners.plan_prompt(task, format, vocabulary=vocabulary)
         assert math.ceil(len(lw.planners.plan_prompt(task, format, vocabulary=True)) / 3) <= MOST_TOKENS
-        assert number % 4 != first % 4 or lw.decode_plan(prompt, task, format).plan is None
+        assert lw.decode_plan(prompt, task, format).plan is None
         assert all(lw.encode_plan(plans[task], format) not in prompt for plans in PLANS.values())
         name = task if format.endswith("_md") and not format.endswith("py_md") else task.replace("-", "_")
         assert lw.TASKS[task].description in prompt[prompt.rindex(name) - 300 :]

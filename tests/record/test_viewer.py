@@ -38,10 +38,8 @@ REMEDIES = {
 }
 
 
-@pytest.mark.parametrize(
-    ("output", "message", "screenshot"),
-    [*((*each, None) for each in REMEDIES.items()), (*next(iter(REMEDIES.items())), "a.png")],
-)
+@pytest.mark.parametrize(("output", "message"), REMEDIES.items())
+@pytest.mark.parametrize("screenshot", [None, "a.png"])
 def test_error_of_a_failing_viewer_names_the_remedy(tmp_path, monkeypatch, output, message, screenshot):
     write(tmp_path / "a.rrd")
     script = tmp_path / "viewer"
